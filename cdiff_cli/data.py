@@ -1,0 +1,224 @@
+"""Demonstrations: episodes of states from Minari or HDF5, the affine normaliser, windows of one horizon."""
+
+import hashlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.tasks import Task
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """x = centre + scale * z, coordinate by coordinate; coordinates of one group share a scale, so a ball stays a ball.
+
+    centre, scale   environment units   [dim]
+    """
+
+    centre: Tensor
+    scale: Tensor
+
+    @classmethod
+    def fit(cls, states: Array, layout: Sequence[str], shared: Sequence[Sequence[str]]) -> "Normaliser":
+        """Limits of the data [n, dim] to [-1, 1]; the widest coordinate of a shared group sets the group's scale."""
+        low, high = states.min(0), states.max(0)
+        half = np.maximum((high - low) / 2, 1e-6)
+        for group in shared:
+            columns = [layout.index(name) for name in group]
+            half[columns] = half[columns].max()
+        return cls(torch.from_numpy((low + high) / 2), torch.from_numpy(half))
+
+    @classmethod
+    def identity(cls, dim: int) -> "Normaliser":
+        return cls(torch.zeros(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
+
+    def encode(self, x: Tensor) -> Tensor:
+        return (x - self.centre.to(x)) / self.scale.to(x)
+
+    def decode(self, z: Tensor) -> Tensor:
+        return self.centre.to(z) + self.scale.to(z) * z
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All stretches of `horizon` consecutive states of the episodes.
+
+    states       all episodes one after the other          [n, dim]
+    starts       where a window may begin                  [m]
+    cumulative   running sum of the drawing probabilities  [m]
+    """
+
+    states: Tensor
+    starts: Tensor
+    cumulative: Tensor
+    horizon: int
+
+    @classmethod
+    def of(cls, episodes: Sequence[Array], horizon: int) -> "Windows":
+        """Windows, each as likely as any other."""
+        lengths = [len(episode) for episode in episodes]
+        if not lengths or max(lengths) < horizon:
+            raise CdiffError(
+                f"the longest of {len(lengths)} episodes has {max(lengths, default=0)} states, a window needs {horizon}; "
+                "use a dataset with longer episodes"
+            )
+        offsets = np.concatenate(([0], np.cumsum(lengths)[:-1]))
+        starts = [o + np.arange(n - horizon + 1) for o, n in zip(offsets, lengths, strict=True) if n >= horizon]
+        every = torch.from_numpy(np.concatenate(starts))
+        uniform = torch.full((len(every),), 1 / len(every), dtype=torch.float64)
+        return cls(torch.from_numpy(np.concatenate(episodes)), every, uniform.cumsum(0), horizon)
+
+    def favour_trips(self, share: float, positions: Sequence[int], velocities: Sequence[int]) -> "Windows":
+        """The same windows, `share` of the draws among those that begin and end at rest, in proportion to their length.
+
+        Plans are pinned at rest at both ends, and long trips fit a window in few places: drawn evenly, the windows most
+        like a plan would be the rarest. Without such windows nothing changes.
+        """
+        speed = self.states[:, velocities].norm(dim=1)
+        still = speed < 0.06 * speed.max()
+        last = self.starts + self.horizon - 1
+        walked = torch.cat((torch.zeros(1), self.states[:, positions].diff(dim=0).norm(dim=1))).double().cumsum(0)
+        weight = torch.where(still[self.starts] & still[last], walked[last] - walked[self.starts], 0.0)
+        if share == 0 or float(weight.sum()) == 0:
+            return self
+        mixed = (1 - share) / len(weight) + share * weight / weight.sum()
+        return replace(self, cumulative=mixed.cumsum(0))
+
+    def __getitem__(self, index: Tensor) -> Tensor:
+        """Windows number `index` [k] as [k, horizon, dim]."""
+        return self.states[self.starts[index][:, None] + torch.arange(self.horizon)]
+
+    def draw(self, n: int, generator: torch.Generator) -> Tensor:
+        where = torch.rand(n, generator=generator, dtype=torch.float64) * self.cumulative[-1]
+        return self[torch.searchsorted(self.cumulative, where).clamp_max(len(self.starts) - 1)]
+
+
+def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None = None) -> list[Array]:
+    """The task's own demonstrations as episodes of states [steps + 1, dim]: generated once as the local Minari dataset
+    `cdiff/<task>-v0`, reused when its steps, seed and content hash are the expected ones.
+    """
+    minari = _minari()
+    name = f"cdiff/{task.name}-v0"
+    if name in minari.list_local_datasets():
+        episodes, metadata = _minari_episodes(minari, name, task)
+        asked = {"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_sha256": digest(episodes)}
+        if {key: metadata.get(key) for key in asked} == asked:
+            return episodes
+        minari.delete_dataset(name)
+    buffers, done = [], 0
+    for number, rows in enumerate(task.demonstrate(steps, seed)):
+        buffers.append(_episode_buffer(rows, number))
+        done += len(rows["actions"])
+        if progress:
+            progress(done, steps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Minari advises on optional metadata that a local dataset does not need
+        dataset = minari.create_dataset_from_buffers(
+            name,
+            buffers,
+            env=task.make_env(),
+            algorithm_name="waypoint controller from rest to rest",
+            author="cdiff",
+            description=f"{steps} steps, seed {seed}, generated by cdiff",
+            data_format="hdf5",
+        )
+    episodes, _ = _minari_episodes(minari, name, task)
+    dataset.storage.update_metadata({"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_sha256": digest(episodes)})
+    return episodes
+
+
+def load_dataset(task: Task, source: str) -> list[Array]:
+    """Episodes of states of a Minari dataset (by its id) or of a D4RL-style HDF5 file (by its path)."""
+    path = Path(source)
+    if path.suffix in (".hdf5", ".h5"):
+        return list(_hdf5_episodes(path, task))
+    minari = _minari()
+    known = sorted(minari.list_local_datasets())
+    if source not in known:
+        raise CdiffError(
+            f'no local Minari dataset "{source}" and no .hdf5 file of that name; here are: {", ".join(known) or "none"}. '
+            "Download one with `minari download ID`, or leave --dataset out to generate demonstrations"
+        )
+    return _minari_episodes(minari, source, task)[0]
+
+
+def digest(episodes: Sequence[Array]) -> str:
+    """sha256 over the lengths and the float64 states of the episodes."""
+    sha = hashlib.sha256(str([episode.shape for episode in episodes]).encode())
+    for episode in episodes:
+        sha.update(np.ascontiguousarray(episode, dtype=np.float64).tobytes())
+    return sha.hexdigest()
+
+
+def _minari() -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import minari
+    return minari
+
+
+def _episode_buffer(rows: dict[str, Any], number: int) -> Any:
+    from minari.data_collector import EpisodeBuffer
+
+    n = len(rows["actions"])
+    first = rows["observations"][0]
+    stacked = {key: np.stack([obs[key] for obs in rows["observations"]]) for key in first}
+    last = [False] * (n - 1) + [True]
+    return EpisodeBuffer(
+        id=number,
+        observations=stacked,
+        actions=np.stack(rows["actions"]),
+        rewards=rows["rewards"],
+        terminations=[False] * n,
+        truncations=last,
+    )
+
+
+def _minari_episodes(minari: Any, name: str, task: Task) -> tuple[list[Array], dict[str, Any]]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        dataset = minari.load_dataset(name)
+        episodes = [task.observe(episode.observations) for episode in dataset.iterate_episodes()]
+    return [_checked(episode, task, name) for episode in episodes], dict(dataset.storage.metadata)
+
+
+def _hdf5_episodes(path: Path, task: Task) -> Iterator[Array]:
+    """D4RL's layout: observations [n, dim], timeouts or terminals [n] marking each episode's last step."""
+    import h5py
+
+    if not path.exists():
+        raise CdiffError(f"{path}: no such file; expected a D4RL-style HDF5 dataset")
+    try:
+        with h5py.File(path, "r") as file:
+            states = np.asarray(file["observations"], dtype=np.float64)
+            ends = np.zeros(len(states), dtype=bool)
+            for key in ("timeouts", "terminals"):
+                if key in file:
+                    ends |= np.asarray(file[key], dtype=bool)
+    except (OSError, KeyError) as error:
+        raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs observations and timeouts") from None
+    for episode in np.split(states, np.flatnonzero(ends) + 1):
+        if len(episode):
+            yield _checked(task.from_d4rl(_checked(episode, task, str(path))), task, str(path))
+
+
+def _checked(episode: Array, task: Task, source: str) -> Array:
+    if episode.ndim != 2 or episode.shape[1] != len(task.layout):
+        raise CdiffError(
+            f"{source}: observations of shape {episode.shape}, but {task.name} has {len(task.layout)} coordinates "
+            f"({', '.join(task.layout)}); choose a dataset of this environment"
+        )
+    if not np.isfinite(episode).all():
+        raise CdiffError(f"{source}: observations hold NaN or inf; repair or choose another dataset")
+    return episode

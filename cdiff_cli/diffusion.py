@@ -1,0 +1,178 @@
+"""Diffusion: schedule, reverse kernels, training loss, and the only loop over the diffusion steps t."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from cdiff_cli.constraint import Constraint, Pins, Traj
+
+Denoiser = Callable[[Traj, int], Traj]
+"""(x_t, t) -> clean estimate x0_hat, normalised coordinates."""
+
+Kernel = Callable[[Traj, Traj, Traj, float, float], Traj]
+"""(x_t, x0, z, alpha_bar_t, alpha_bar_{t-1}) -> x_{t-1}."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Noise levels alpha_bar[i] for i = 0 (clean) ... n_steps, and the trained step t[i] each one belongs to.
+
+    q(x_t | x_0) = N(sqrt(alpha_bar_t) x_0, (1 - alpha_bar_t) I)
+    """
+
+    alpha_bar: tuple[float, ...]
+    t: tuple[int, ...]
+
+    @classmethod
+    def cosine(cls, n_steps: int) -> "Schedule":
+        """Cosine schedule with offset s = 0.008 and beta at most 0.999 (Nichol and Dhariwal, 2021)."""
+        level = [math.cos((i / n_steps + 0.008) / 1.008 * math.pi / 2) ** 2 for i in range(n_steps + 1)]
+        alpha_bar = [1.0]
+        for now, before in zip(level[1:], level[:-1], strict=True):
+            alpha_bar.append(alpha_bar[-1] * (1 - min(1 - now / before, 0.999)))
+        return cls(tuple(alpha_bar), tuple(range(n_steps + 1)))
+
+    @property
+    def n_steps(self) -> int:
+        return len(self.t) - 1
+
+    def beta(self, i: int) -> float:
+        """beta_t = 1 - alpha_bar_t / alpha_bar_{t-1}."""
+        return 1 - self.alpha_bar[i] / self.alpha_bar[i - 1]
+
+    def respaced(self, n_steps: int) -> "Schedule":
+        """The same noise range in fewer steps, evenly spread over t, the noisiest always among them."""
+        keep = [0, *(round(k * self.n_steps / n_steps) for k in range(1, n_steps + 1))]
+        return Schedule(tuple(self.alpha_bar[i] for i in keep), tuple(self.t[i] for i in keep))
+
+
+def ddpm(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:
+    """Posterior q(x_{t-1} | x_t, x_0) (Ho et al., 2020, Eq. 7): Eq. 4 of the paper with the posterior's variance."""
+    beta = 1 - a / b
+    mean = math.sqrt(b) * beta / (1 - a) * x0 + math.sqrt(1 - beta) * (1 - b) / (1 - a) * x
+    return mean + math.sqrt(beta * (1 - b) / (1 - a)) * z
+
+
+def ddim(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:
+    """Deterministic step (Song et al., 2021, Eq. 12 with sigma = 0)."""
+    noise = (x - math.sqrt(a) * x0) / math.sqrt(1 - a)
+    return math.sqrt(b) * x0 + math.sqrt(1 - b) * noise
+
+
+def langevin(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:
+    """x_{t-1} = x_t + (beta_t / 2) score + sqrt(beta_t) z (paper, Eq. 8), score by Eq. 7. It is not the step that samples
+    a trained model: see the known-answer tests.
+    """
+    beta = 1 - a / b
+    score = -(x - math.sqrt(a) * x0) / (1 - a)
+    return x + beta / 2 * score + math.sqrt(beta) * z
+
+
+KERNELS: dict[str, Kernel] = {"ddpm": ddpm, "ddim": ddim, "langevin": langevin}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One reverse step as a method sees it: what is known, and the one way on.
+
+    x, x0     x_t and its clean estimate, pins painted, normalised   [batch, horizon, dim]
+    beta      beta_t
+    reverse   clean estimate -> x_{t-1}; noise z and pins already bound
+    last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
+    """
+
+    x: Traj
+    x0: Traj
+    beta: float
+    reverse: Callable[[Traj], Traj]
+    pins: Pins
+    last: bool
+
+
+class Method(Protocol):
+    """A way to obey g <= 0 while sampling: hyper-parameters only, its state is passed in and returned."""
+
+    def init(self, x: Traj, g: Constraint) -> Any: ...
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]: ...
+
+
+@dataclass
+class Noise:
+    """Standard normal draws of one shape for a batch, one generator a seed, so that a seed's plan does not depend on its
+    neighbours in the batch and every method meets the same x_T and z.
+    """
+
+    seeds: Sequence[int]
+    shape: tuple[int, int]
+    device: torch.device | str = "cpu"
+    _generators: list[torch.Generator] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._generators = [torch.Generator().manual_seed(seed) for seed in self.seeds]
+
+    def __call__(self) -> Traj:
+        """The next draw [batch, horizon, dim]."""
+        draws = [torch.randn(self.shape, generator=generator) for generator in self._generators]
+        return torch.stack(draws).to(self.device) if draws else torch.empty(0, *self.shape, device=self.device)
+
+
+def sample(
+    denoiser: Denoiser,
+    schedule: Schedule,
+    method: Method,
+    g: Constraint,
+    pins: Pins,
+    noise: Callable[[], Traj],
+    *,
+    kernel: Kernel = ddpm,
+    extra_steps: int = 0,
+    on_step: Callable[[int, Step, Traj], None] | None = None,
+) -> Traj:
+    """Plans x_0 in normalised coordinates [batch, horizon, dim].
+
+    extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
+    on_step      called with the number of network calls so far, the step and x_{t-1}
+    """
+    x = pins.paint(noise())
+    state = method.init(x, g)
+    for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):
+        x0 = pins.paint(denoiser(x, schedule.t[i]))
+        last = i == 1
+        z = torch.zeros_like(x) if last else noise()
+        a, b = schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
+        here = x
+
+        def reverse(clean: Traj, x: Traj = here, z: Traj = z, a: float = a, b: float = b) -> Traj:
+            return pins.paint(kernel(x, clean, z, a, b))
+
+        step = Step(here, x0, schedule.beta(i), reverse, pins, last)
+        x, state = method.step(step, g, state)
+        if on_step:
+            on_step(call, step, x)
+    return x
+
+
+def training_loss(
+    net: nn.Module, schedule: Schedule, x0: Traj, pinned: Tensor, smoothness: float, generator: torch.Generator, bf16: bool
+) -> tuple[Tensor, Tensor]:
+    """(loss, mean squared error) of the clean estimate at random steps t, both scalars.
+
+    loss = |e|^2 + smoothness |e^{tau+1} - e^tau|^2 with e = x0_hat - x_0: a quadratic form of e, so its minimiser is still
+    E[x_0 | x_t], and the jitter between neighbouring waypoints is learnt away sooner.
+
+    x0      clean windows, normalised                          [batch, horizon, dim]
+    pinned  coordinates given clean, as they are in sampling   [horizon, dim]
+    """
+    t = torch.randint(1, schedule.n_steps + 1, (len(x0),), generator=generator)
+    z = torch.randn(x0.shape, generator=generator).to(x0)
+    a = torch.tensor(schedule.alpha_bar, dtype=x0.dtype)[t].to(x0)[:, None, None]
+    x_t = torch.where(pinned, x0, a.sqrt() * x0 + (1 - a).sqrt() * z)
+    with torch.autocast(x0.device.type, torch.bfloat16, enabled=bf16):
+        estimate = net(x_t, t.to(x0))
+    e = torch.where(pinned, 0.0, estimate.float() - x0)
+    mse = e.square().mean()
+    return mse + smoothness * e.diff(dim=1).square().mean(), mse.detach()

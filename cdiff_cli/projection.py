@@ -1,0 +1,277 @@
+"""Euclidean projection onto {x : g(x) <= 0, pinned coordinates fixed}: exact forms where the structure is known.
+
+    P(z) = argmin |x - z|^2  s.t.  g(x) <= 0          (paper, the projection operator)
+
+half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
+control-barrier chain over a half-space or a ball        weighted isotonic regression (min-max formula)
+several parts                                            Dykstra's algorithm over the exact forms
+anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
+"""
+
+import warnings
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cdiff_cli.constraint import Affine, Chain, Constraint, Ellipsoid, Level, Part, Pins, Quadric, Rows, Traj, Waypoints
+from cdiff_cli.errors import InfeasibleError
+
+ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+
+
+def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
+    """The trajectory nearest to z [batch, horizon, dim] that satisfies g and the pins.
+
+    Convex parts with a closed form: the global nearest point. Non-convex intersections: a feasible local one. Raises
+    InfeasibleError, naming rows, where none was found.
+    """
+    z = pins.paint(z)
+    tolerance = 1e-9 if z.dtype == torch.float64 else 2e-6
+    _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
+    if not g.parts or z.numel() == 0:
+        return z
+    if all(has_exact_form(part) for part in g.parts):
+        if len(g.parts) == 1:
+            return exact(g.parts[0], z, pins)
+        x = _dykstra(g, z, pins, tolerance)
+        if bool((_free_rows(g, x, pins) <= 100 * tolerance).all()):
+            return x
+    return _sequential(g, z, pins, tolerance)
+
+
+def has_exact_form(part: Part) -> bool:
+    if isinstance(part, Waypoints):
+        return isinstance(part.level, Affine | Quadric | Ellipsoid)
+    return isinstance(part, Chain) and (
+        isinstance(part.level, Affine) or (isinstance(part.level, Ellipsoid) and part.level.side > 0 and part.level.is_ball)
+    )
+
+
+def exact(part: Part, z: Traj, pins: Pins) -> Traj:
+    """Projection onto one part that has an exact form."""
+    if isinstance(part, Waypoints):
+        return pins.paint(nearest(part.level, z))
+    assert isinstance(part, Chain)
+    return _project_chain(part, z, pins)
+
+
+# one waypoint ---------------------------------------------------------------------------------------------------------
+
+
+def nearest(level: Level, z: Tensor) -> Tensor:
+    """The nearest state with f <= 0, for states z [..., dim]."""
+    if isinstance(level, Affine):
+        size = (level.a @ level.a).clamp_min(1e-30)
+        return z - (level(z).clamp_min(0) / size)[..., None] * level.a
+    if isinstance(level, Ellipsoid):
+        return _nearest_ball(level, z) if level.is_ball else _nearest_quadric(level.quadric(), z)
+    assert isinstance(level, Quadric)
+    return _nearest_quadric(level, z)
+
+
+def _nearest_ball(ball: Ellipsoid, z: Tensor) -> Tensor:
+    """Radially to the sphere; a point at the very centre goes along the first axis."""
+    inner = z @ ball.which.T
+    radial = inner - ball.centre
+    length = radial.norm(dim=-1, keepdim=True)
+    first = torch.zeros_like(radial)
+    first[..., 0] = 1.0
+    unit = torch.where(length > 1e-12, radial / length.clamp_min(1e-12), first)
+    wrong = length < ball.axes[0] if ball.side > 0 else length > ball.axes[0]
+    moved = torch.where(wrong, ball.centre + ball.axes[0] * unit, inner)
+    return z + (moved - inner) @ ball.which
+
+
+def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
+    """min |x - z|^2 s.t. x.P x + q.x <= r, for P of any signature, by its scalar secular equation.
+
+    In the eigenbasis of P stationarity reads y(mu) = (y0 - mu q / 2) / (1 + mu lambda); f(y(mu)) falls on
+    0 <= mu < -1 / min(lambda), and its root there is the global minimiser (S-lemma). Bisection in float64.
+    """
+    wrong = quadric(z) > 0
+    if not bool(wrong.any()):
+        return z
+    eigenvalue, basis = torch.linalg.eigh(quadric.P.double())
+    y0 = z[wrong].double() @ basis
+    q, r = quadric.q.double() @ basis, quadric.r.double()
+    lowest = eigenvalue[0]
+    if lowest < 0:  # at a stationary point of f the root would be missed: step off it along the steepest way out
+        stuck = (2 * y0[:, 0] * lowest + q[0]).abs() < 1e-9 * eigenvalue.abs().max()
+        y0[:, 0] = torch.where(stuck, y0[:, 0] + 1e-6, y0[:, 0])
+    ceiling = float(-1 / lowest) if lowest < 0 else np.inf
+
+    def y(mu: Tensor) -> Tensor:
+        return (y0 - mu[:, None] * q / 2) / (1 + mu[:, None] * eigenvalue)
+
+    def f(mu: Tensor) -> Tensor:
+        at = y(mu)
+        return (at.square() * eigenvalue).sum(-1) + at @ q - r
+
+    low = torch.zeros(len(y0), dtype=torch.float64, device=z.device)
+    high = torch.full_like(low, ceiling * (1 - 1e-12) if np.isfinite(ceiling) else 1.0)
+    if not np.isfinite(ceiling):
+        for _ in range(200):
+            short = f(high) > 0
+            if not bool(short.any()):
+                break
+            high = torch.where(short, 4 * high, high)
+    if bool((f(high) > 1e-6 * (1 + r.abs())).any()):
+        raise InfeasibleError("a quadratic constraint has no feasible point at all: x.P x + q.x never falls to r; raise r")
+    for _ in range(100):
+        middle = (low + high) / 2
+        above = f(middle) > 0
+        low, high = torch.where(above, middle, low), torch.where(above, high, middle)
+    out = z.clone()
+    out[wrong] = (y(high) @ basis.T).to(z)
+    return out
+
+
+# chains ---------------------------------------------------------------------------------------------------------------
+
+
+def _project_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
+    """Project h(x^tau) onto the chain, then each waypoint onto its new level of h."""
+    level, gamma = chain.level, 1 - chain.alpha
+    if isinstance(level, Affine):
+        slope = torch.where(pins.mask, 0.0, level.a)  # [horizon, dim]: only free coordinates move
+        size = slope.square().sum(-1)
+        h = -level(z)
+        target = nearest_chain(h, gamma, 1 / size.clamp_min(1e-30), size == 0)
+        return z - ((target - h) / size.clamp_min(1e-30))[..., None] * slope
+    assert isinstance(level, Ellipsoid)
+    radial = z @ level.which.T - level.centre
+    length = radial.norm(dim=-1, keepdim=True)
+    unit = radial / length.clamp_min(1e-12)
+    unit[..., 0] = torch.where(length[..., 0] > 1e-12, unit[..., 0], 1.0)
+    h = length[..., 0] / level.axes[0] - 1  # in units of the radius: the same chain
+    fixed = (pins.mask @ level.which.T.bool().to(pins.mask) if False else pins.mask[:, level.which.argmax(1)]).any(1)
+    target = nearest_chain(h, gamma, torch.ones_like(h[0]), fixed)
+    step = (target - h).clamp_min(-(h + 1)) * level.axes[0]
+    return z + (step[..., None] * unit) @ level.which
+
+
+def nearest_chain(h: Rows, gamma: float, weight: Tensor, fixed: Tensor) -> Rows:
+    """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k where fixed.
+
+    In y_k = v_k / gamma^k this is isotonic regression, solved by its min-max formula with powers counted from each block's
+    first index, so that none underflows; the fixed ends bound it, and a bounded isotonic regression is the clipped one.
+
+    h [batch, n], weight [n], fixed [n] (only a first and a last run of indices may be fixed)
+    """
+    n = h.shape[1]
+    free = torch.nonzero(~fixed)[:, 0]
+    if len(free) == 0:
+        return h
+    first, last = int(free[0]), int(free[-1]) + 1
+    inner, w = h[:, first:last], weight[first:last]
+    m = last - first
+    index = torch.arange(m, device=h.device)
+    ahead = index[None, :] - index[:, None]
+    power = torch.where(ahead >= 0, gamma ** ahead.clamp_min(0).to(h.dtype), 0.0)  # gamma^(k - i), k >= i
+    value = (power * w * inner[:, None, :]).cumsum(-1) / (power * power * w).cumsum(-1).clamp_min(1e-300)
+    value = torch.where(ahead >= 0, value, torch.inf)
+    block = value.flip(-1).cummin(-1).values.flip(-1)  # min over j >= k of the block value that starts at i
+    reach = torch.where(ahead >= 0, power * torch.where(ahead >= 0, block, 0.0), -torch.inf)  # at k, from block start i
+    best = reach.max(1).values
+    if first > 0:
+        best = torch.maximum(best, gamma ** (index + 1).to(h.dtype) * h[:, first - 1 : first])
+    if last < n:
+        left = gamma ** (m - index).to(h.dtype)
+        best = torch.minimum(best, torch.where(left > 0, h[:, last : last + 1] / left.clamp_min(1e-300), torch.inf))
+    return torch.cat((h[:, :first], best, h[:, last:]), 1)
+
+
+# several at once, and anything else -----------------------------------------------------------------------------------
+
+
+def _dykstra(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> Traj:
+    """Dykstra's algorithm: the projection onto the intersection of convex sets; on others a heuristic that is checked."""
+    x, left = z, [torch.zeros_like(z) for _ in g.parts]
+    for _ in range(ROUNDS):
+        before = x
+        for i, part in enumerate(g.parts):
+            y = exact(part, x + left[i], pins)
+            left[i] = x + left[i] - y
+            x = y
+        if float((x - before).abs().max()) <= tolerance / 10 and bool((_free_rows(g, x, pins) <= tolerance).all()):
+            break
+    return x
+
+
+def _sequential(g: Constraint, z: Traj, pins: Pins, tolerance: float, rounds: int = 50) -> Traj:
+    """Sequential linearisation, one plan after another: min |x - z|^2 s.t. g(x_k) + J(x_k) (x - x_k) <= 0."""
+    import qpsolvers
+    from scipy import sparse
+
+    out = z.clone()
+    for b in range(len(z)):
+        free = ~pins.mask.flatten().cpu().numpy()
+        target = z[b].double().cpu().numpy().ravel()
+        x = out[b : b + 1].double()
+        one = Pins(pins.mask, x)
+        g64 = g.to(x)
+        for _ in range(rounds):
+            rows, pull, _ = g64.linearise(x)
+            jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]
+            slack = -rows[0].cpu().numpy() + jacobian @ x.flatten().cpu().numpy()[free]
+            useful = np.abs(jacobian).max(1) > 1e-12
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # ProxQP's format advice
+                step = qpsolvers.solve_qp(
+                    sparse.eye(int(free.sum()), format="csc"),
+                    -target[free],
+                    sparse.csc_matrix(jacobian[useful]),
+                    slack[useful],
+                    solver="proxqp",
+                    eps_abs=min(tolerance, 1e-9),
+                )
+            if step is None or not np.isfinite(step).all():
+                break
+            flat = x.flatten().clone()
+            flat[torch.from_numpy(free).to(x.device)] = torch.from_numpy(step).to(x)
+            moved = float((flat - x.flatten()).abs().max())
+            x = flat.reshape(x.shape)
+            if moved < 1e-9:
+                break
+        worst = _free_rows(g64, x, one)[0]
+        if not bool((worst <= 1e-5).all()):
+            labels = g.labels(z.shape[1])
+            order = worst.argsort(descending=True)[:4].tolist()
+            rows_in_conflict = ", ".join(f"{labels[i]} ({float(worst[i]):.3g} over)" for i in order if float(worst[i]) > 1e-5)
+            raise InfeasibleError(
+                f"no trajectory found that satisfies all constraints together; in conflict: {rows_in_conflict or labels[0]}; "
+                "relax or remove one of them"
+            )
+        out[b] = x[0].to(z)
+    return out
+
+
+def _free_rows(g: Constraint, x: Traj, pins: Pins) -> Rows:
+    """g(x), without the rows that touch pinned coordinates alone (those are checked once, up front)."""
+    rows = g(x)
+    return torch.where(_movable(g, x, pins), rows, rows.clamp_max(0.0))
+
+
+def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
+    """Rows [n] that some free coordinate of the trajectory enters."""
+    free = (~pins.mask).any(1)
+    each = []
+    for part in g.parts:
+        if isinstance(part, Waypoints):
+            each.append(free)
+        elif isinstance(part, Chain):
+            each.append(free[:-1] | free[1:])
+        else:
+            each.append(torch.ones(len(part.labels(x.shape[1])), dtype=torch.bool, device=x.device))
+    return torch.cat(each)
+
+
+def _refuse_pinned_violations(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> None:
+    """A pinned state outside the set can never be repaired: say so before moving anything else."""
+    if not bool(pins.mask.any()) or not g.parts or z.numel() == 0:
+        return
+    stuck = torch.where(_movable(g, z, pins), 0.0, g(z)) > tolerance
+    if bool(stuck.any()):
+        row = int(stuck.any(0).nonzero()[0])
+        raise InfeasibleError(f"the pinned state violates {g.labels(z.shape[1])[row]}; move the start or goal, or the constraint")

@@ -1,0 +1,115 @@
+"""Recipes and cards: how a task's model is trained and sampled, and what a trained checkpoint says of itself."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from cdiff_cli.config import Strict, load
+from cdiff_cli.errors import CdiffError
+
+Positive = Annotated[int, Field(gt=0)]
+
+
+class NetworkSpec(Strict):
+    """Size of the TemporalUnet."""
+
+    width: Positive = 32
+    multipliers: tuple[Positive, ...] = (1, 2, 4)
+
+
+class TrainSpec(Strict):
+    """One way to train; the defaults are those of the small recipe."""
+
+    network: NetworkSpec = NetworkSpec()
+    steps: Positive
+    batch: Positive = 32
+    accumulate: Positive = 1
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    schedule: str = Field("cosine", pattern="^(cosine|constant)$")
+    ema: Annotated[float, Field(ge=0, lt=1)] = 0.995
+    smoothness: Annotated[float, Field(ge=0)] = 10.0
+    trips: Annotated[float, Field(ge=0, le=1)] = 0.5
+    clip: Annotated[float, Field(gt=0)] | None = 1.0
+    bf16: bool = True
+
+
+class DemonstrationSpec(Strict):
+    """The task's own demonstrations."""
+
+    steps: Positive = 1_000_000
+    seed: int = 0
+
+
+class PaperUnits(Strict):
+    """The paper's own definitions where they differ: its violation is ours times `violation`, its distance sums
+    (distance to the mean unconstrained plan) ** distance_power."""
+
+    violation: float = 1.0
+    distance_power: float = 1.0
+
+
+class Preset(Strict):
+    """How to sample: the kernel, frozen extra steps, the final polish, and each method's constants by its name."""
+
+    kernel: str = Field("ddpm", pattern="^(ddpm|ddim|langevin)$")
+    extra_steps: Annotated[int, Field(ge=0)] = 0
+    polish: bool = False
+    methods: dict[str, dict[str, Any]] = {}
+
+
+class Recipe(Strict):
+    """models/<task>/recipe.yaml"""
+
+    task: str
+    horizon: Positive
+    n_steps: Positive
+    start: dict[str, float] | None = None
+    goal: dict[str, float] | None = None
+    constraints: str
+    demonstrations: DemonstrationSpec = DemonstrationSpec()
+    train: dict[str, TrainSpec] = {}
+    presets: dict[str, Preset]
+    paper_units: PaperUnits = PaperUnits()
+
+
+class Card(Strict):
+    """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like."""
+
+    task: str
+    recipe: str
+    horizon: int
+    n_steps: int
+    network: NetworkSpec
+    parameters: int
+    steps: int
+    seed: int
+    loss: float
+    mse: float
+    dataset: str
+    data_sha256: str
+    weights_sha256: str
+    commit: str
+    device: str
+    threads: int
+    wall_s: float
+    data: dict[str, float]
+
+
+def home() -> Path:
+    """Where models/ and constraints/ are: the working directory if it has them, else the checkout, else the package."""
+    package = Path(__file__).parent
+    for place in (Path.cwd(), package.parent, package / "shipped"):
+        if (place / "models").is_dir() and (place / "constraints").is_dir():
+            return place
+    raise CdiffError("no folder models/ and constraints/ here; run cdiff in its checkout, or reinstall it")
+
+
+def shown(path: Path) -> Path:
+    """The path relative to the working directory where it lies below it."""
+    return Path(os.path.relpath(path)) if path.is_absolute() and path.is_relative_to(Path.cwd()) else path
+
+
+def load_recipe(task: str) -> Recipe:
+    return load(shown(home() / "models" / task / "recipe.yaml"), Recipe)

@@ -1,0 +1,78 @@
+"""The environments: a literal table from name to module, and what every task offers."""
+
+import difflib
+import importlib
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdiff_cli.errors import CdiffError
+
+TASKS = {
+    "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
+    "maze2d-large": "cdiff_cli.tasks.maze2d:LARGE",
+    "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
+}
+
+
+class Task(Protocol):
+    """One environment: names, units and geometry of its states, demonstrations, and how to run it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def layout(self) -> tuple[str, ...]:
+        """Names of a state's coordinates, in order; YAML and reports use these, never indices."""
+        ...
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each coordinate."""
+        ...
+
+    @property
+    def positions(self) -> tuple[str, ...]:
+        """The coordinates distances and jumps are measured in."""
+        ...
+
+    @property
+    def velocities(self) -> tuple[str, ...]:
+        """The rates of the positions, or nothing where the state has none."""
+        ...
+
+    @property
+    def shared_scale(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of coordinates that share one scale in the normaliser."""
+        ...
+
+    @property
+    def dt(self) -> float:
+        """Seconds between waypoints."""
+        ...
+
+    def make_env(self, render: bool = False) -> Any: ...
+    def observe(self, obs: Any) -> NDArray[np.float64]: ...
+    def from_d4rl(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """States of D4RL's dataset of this environment, in this task's frame."""
+        ...
+
+    def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]: ...
+    def walls(self) -> NDArray[np.float64]:
+        """Solid boxes (x_min, y_min, x_max, y_max) in the plane of the positions [n, 4]."""
+        ...
+
+
+def load_task(name: str) -> Any:
+    """The task of that name; a CdiffError with a suggestion where there is none."""
+    if name not in TASKS:
+        raise CdiffError(f'no task "{name}"{suggestion(name, TASKS)}; choose from {", ".join(TASKS)}')
+    module, attribute = TASKS[name].split(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def suggestion(name: str, known: Any) -> str:
+    """', did you mean "x"?' for the closest known name, or nothing."""
+    close = difflib.get_close_matches(name, list(known), 1, 0.5)
+    return f' (did you mean "{close[0]}"?)' if close else ""

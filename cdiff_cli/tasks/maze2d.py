@@ -1,0 +1,201 @@
+"""Maze2D: a ball pushed through a maze by a bounded force (Gymnasium-Robotics PointMaze).
+
+Frame: cell centres at x = column + 0.5 - W / 2, y = H / 2 - row - 0.5 (metres), walls are unit boxes, ball radius 0.1 m,
+dt 0.01 s, force in [-1, 1] on each axis, speed clipped at 5 m/s on each axis.
+"""
+
+import heapq
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Cell = tuple[int, int]
+
+DT = 0.01
+BALL_RADIUS = 0.1
+MAX_SPEED = 5.0
+ACCELERATION = 23.82  # m/s^2 a unit of force, fitted: v' = 0.9976 v + 0.2382 u
+SUCCESS_RADIUS = 0.45  # PointMaze's own success test
+
+
+@dataclass(frozen=True)
+class Maze2D:
+    """One maze. rows: the map, '#' a wall, ' ' free."""
+
+    name: str
+    env_id: str
+    horizon: int
+    rows: tuple[str, ...]
+
+    layout = ("x", "y", "vx", "vy")
+    units = ("m", "m", "m/s", "m/s")
+    positions = ("x", "y")
+    velocities = ("vx", "vy")
+    shared_scale = (("x", "y"), ("vx", "vy"))
+    dt = DT
+    pinned = "start and goal"
+
+    def make_env(self, render: bool = False, max_steps: int = 10**9) -> Any:
+        """The Gymnasium environment, continuing (it never resets the goal by itself)."""
+        import gymnasium
+        import gymnasium_robotics
+
+        gymnasium.register_envs(gymnasium_robotics)
+        return gymnasium.make(
+            self.env_id,
+            continuing_task=True,
+            reset_target=False,
+            max_episode_steps=max_steps,
+            render_mode="rgb_array" if render else None,
+        )
+
+    def observe(self, obs: Any) -> Array:
+        """State (x, y, vx, vy) of an observation, or of a whole episode of observations."""
+        return np.asarray(obs["observation"] if isinstance(obs, dict) else obs, dtype=np.float64)
+
+    def from_d4rl(self, states: Array) -> Array:
+        """D4RL's (row, column, their rates), whose cells lie 0.2 lower, as (x, y, vx, vy)."""
+        row, col, v_row, v_col = states.T
+        x = col + 0.2 + 0.5 - len(self.rows[0]) / 2
+        y = len(self.rows) / 2 - 0.5 - (row + 0.2)
+        return np.stack((x, y, v_col, -v_row), axis=1)
+
+    # geometry ---------------------------------------------------------------------------------------------------------
+
+    def centre(self, cell: Cell) -> Array:
+        row, col = cell
+        return np.array([col + 0.5 - len(self.rows[0]) / 2, len(self.rows) / 2 - row - 0.5])
+
+    def cell(self, point: Array) -> Cell:
+        return int(np.floor(len(self.rows) / 2 - point[1])), int(np.floor(point[0] + len(self.rows[0]) / 2))
+
+    def cells(self, kind: str) -> list[Cell]:
+        return [(r, c) for r, row in enumerate(self.rows) for c, k in enumerate(row) if k == kind]
+
+    def walls(self) -> Array:
+        """Boxes (x_min, y_min, x_max, y_max) of the walls [n, 4]."""
+        centres = np.array([self.centre(cell) for cell in self.cells("#")])
+        return np.concatenate((centres - 0.5, centres + 0.5), axis=1)
+
+    def is_free(self, point: Array, clearance: float = 0.0) -> bool:
+        """Whether a ball of radius clearance at the point touches no wall and lies inside the maze."""
+        row, col = self.cell(point)
+        if not (0 <= row < len(self.rows) and 0 <= col < len(self.rows[0])):
+            return False
+        box = self.walls()
+        nearest = np.clip(point, box[:, :2], box[:, 2:])
+        return bool(np.linalg.norm(nearest - point, axis=1).min() > clearance)
+
+    def route(self, start: Array, goal: Array, cost: Callable[[Cell], float] = lambda _: 1.0) -> list[Cell]:
+        """Cells of a cheapest path (Dijkstra over free cells), both ends included."""
+        source, target = self.cell(start), self.cell(goal)
+        free = set(self.cells(" "))
+        done: dict[Cell, Cell | None] = {}
+        queue: list[tuple[float, Cell, Cell | None]] = [(0.0, source, None)]
+        while queue:
+            so_far, here, before = heapq.heappop(queue)
+            if here in done:
+                continue
+            done[here] = before
+            if here == target:
+                break
+            row, col = here
+            for there in ((row + 1, col), (row - 1, col), (row, col + 1), (row, col - 1)):
+                if there in free and there not in done:
+                    heapq.heappush(queue, (so_far + cost(there), there, here))
+        path: list[Cell] = []
+        step: Cell | None = target
+        while step is not None:
+            path.append(step)
+            step = done[step]
+        return path[::-1]
+
+    def path_length(self, start: Array, goal: Array) -> float:
+        """Length of the shortest route through cell centres, its first and last cell entered straight (metres)."""
+        inner = [self.centre(cell) for cell in self.route(start, goal)[1:-1]]
+        points = np.array([start, *inner, goal])
+        return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+    def random_point(self, rng: np.random.Generator, spread: float = 0.3) -> Array:
+        """A point within spread of a random free cell's centre (metres)."""
+        free = self.cells(" ")
+        return self.centre(free[rng.integers(len(free))]) + rng.uniform(-spread, spread, 2)
+
+    # demonstrations ---------------------------------------------------------------------------------------------------
+
+    def demonstrate(self, n_steps: int, seed: int, episode_steps: int = 2000) -> Iterator[dict[str, Any]]:
+        """Episodes of trips from rest to rest by a waypoint controller, n_steps environment steps in all.
+
+        A trip goes to a random point along a shortest route over randomly weighted cells, its waypoints jittered by
+        0.15 m, at a random top speed, with smooth random forces added, and ends with a hold of random length, so that
+        plans pinned at rest lie in the data.
+        """
+        rng = np.random.default_rng(seed)
+        env = self.make_env().unwrapped
+        for first in range(0, n_steps, episode_steps):
+            obs, _ = env.reset(seed=int(rng.integers(2**31)))
+            steps = min(episode_steps, n_steps - first)
+            rows: dict[str, list[Any]] = {"observations": [obs], "actions": [], "rewards": []}
+            trip: Iterator[Array] = iter(())
+            while len(rows["actions"]) < steps:
+                goal = self.random_point(rng)
+                env.goal = goal
+                trip = self._trip(lambda: rows["observations"][-1]["observation"], goal, rng)
+                for u in trip:
+                    obs, reward, _, _, _ = env.step(u.astype(np.float32))
+                    rows["observations"].append(obs)
+                    rows["actions"].append(u.astype(np.float32))
+                    rows["rewards"].append(reward)
+                    if len(rows["actions"]) == steps:
+                        break
+            yield rows
+        env.close()
+
+    def _trip(self, state: Callable[[], Array], goal: Array, rng: np.random.Generator) -> Iterator[Array]:
+        """Forces of one trip from the present state to rest at the goal, and of the hold there."""
+        weights: dict[Cell, float] = {}
+        route = self.route(state()[:2], goal, lambda cell: weights.setdefault(cell, rng.uniform(1.0, 1.6)))
+        points = [*(self.centre(cell) + rng.uniform(-0.15, 0.15, 2) for cell in route[1:-1]), goal]
+        top_speed, corner_speed = rng.uniform(2.8, 5.0), rng.uniform(2.0, 3.4)
+        drift, hold = np.zeros(2), int(rng.integers(0, 160))
+        while hold >= 0:
+            x = state()
+            p, v = x[:2], x[2:]
+            while len(points) > 1 and np.hypot(*(points[0] - p)) < 0.5:
+                points.pop(0)
+            d = points[0] - p
+            distance = float(np.hypot(*d))
+            if len(points) == 1:
+                speed = min(top_speed, 9.0 * distance, np.sqrt(2 * 16.0 * distance))
+                hold -= distance < 0.08
+            else:
+                after = points[1] - points[0]
+                straight = max(0.0, float(d @ after) / max(distance * np.hypot(*after), 1e-9))
+                turn = corner_speed + straight * (top_speed - corner_speed)
+                speed = min(top_speed, np.sqrt(turn**2 + 2 * 16.0 * max(distance - 0.5, 0.0)))
+            drift = 0.9 * drift + rng.normal(0.0, 0.08, 2)
+            wanted = d * (speed / max(distance, 1e-9))
+            yield np.clip((wanted - v) * 0.6 + drift * min(1.0, distance / 0.3), -1.0, 1.0)
+
+
+UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"))
+LARGE = Maze2D(
+    "maze2d-large",
+    "PointMaze_Large-v3",
+    384,
+    (
+        "############",
+        "#    #     #",
+        "# ## # # # #",
+        "#      #   #",
+        "# #### ### #",
+        "#  # #     #",
+        "## # # # ###",
+        "#  #   #   #",
+        "############",
+    ),
+)

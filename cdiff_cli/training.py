@@ -1,0 +1,347 @@
+"""Fitting the denoiser; checkpoints as safetensors with a card; training that resumes to the same bits."""
+
+import contextlib
+import hashlib
+import math
+import os
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from cdiff_cli.data import Normaliser, Progress, Windows, demonstrations, digest, load_dataset
+from cdiff_cli.diffusion import Schedule, training_loss
+from cdiff_cli.errors import CdiffError, CheckpointError
+from cdiff_cli.networks import TemporalUnet
+from cdiff_cli.recipe import Card, NetworkSpec, Recipe, TrainSpec, home, shown
+from cdiff_cli.tasks import Task, suggestion
+
+SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A trained denoiser and what belongs to it.
+
+    demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
+    """
+
+    net: TemporalUnet
+    normaliser: Normaliser
+    demonstrations: Tensor
+    card: Card
+    path: Path
+
+
+@dataclass(frozen=True)
+class Status:
+    """Told after each training step."""
+
+    step: int
+    steps: int
+    loss: float
+
+
+def choose_device(name: str) -> torch.device:
+    """`auto` is cuda where there is one, else cpu."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise CdiffError(f'device "{name}" cannot be used here: {str(error).splitlines()[0]}; try --device cpu') from None
+    return device
+
+
+def train(
+    task: Task,
+    recipe: Recipe,
+    size: str,
+    *,
+    seed: int,
+    device: torch.device,
+    work: Path,
+    resume: bool = False,
+    dataset: str | None = None,
+    save_every: int = 500,
+    on_data: Progress | None = None,
+    on_step: Callable[[Status], None] | None = None,
+) -> Checkpoint:
+    """Train the recipe's network of that size and return the finished checkpoint, saved at work/model.safetensors.
+
+    work holds state.safetensors, written every save_every steps and on interruption; resume goes on from there and, on one
+    CPU with as many threads, ends with the same bits as an uninterrupted run.
+    """
+    if size not in recipe.train:
+        raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
+    spec = recipe.train[size]
+    asked = recipe.demonstrations
+    episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
+    states = np.concatenate(episodes)
+    normaliser = Normaliser.fit(states, task.layout, task.shared_scale)
+    windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
+    if task.velocities:
+        columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
+        windows = windows.favour_trips(spec.trips, *columns)
+    commit = git_commit()
+    fit = _Fit.start(len(task.layout), spec, seed, device, digest(episodes))
+    if resume:
+        fit.load(work / "state.safetensors")
+    schedule, pinned = Schedule.cosine(recipe.n_steps), end_pins(recipe.horizon, len(task.layout)).to(device)
+    work.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic() - fit.wall_s
+    try:
+        while fit.step < spec.steps:
+            loss = fit.advance(windows, schedule, pinned)
+            if on_step:
+                on_step(Status(fit.step, spec.steps, loss))
+            fit.wall_s = time.monotonic() - began
+            if fit.step % save_every == 0:
+                fit.save(work / "state.safetensors")
+    except BaseException:
+        fit.save(work / "state.safetensors")
+        raise
+    fit.save(work / "state.safetensors")
+    card = {
+        "task": task.name,
+        "recipe": size,
+        "horizon": recipe.horizon,
+        "n_steps": recipe.n_steps,
+        "network": spec.network.model_dump(mode="json"),
+        "parameters": sum(p.numel() for p in fit.ema.parameters()),
+        "steps": fit.step,
+        "seed": seed,
+        "loss": round(fit.loss_average, 7),
+        "mse": round(fit.mse_average, 7),
+        "dataset": dataset or f"cdiff/{task.name}-v0",
+        "data_sha256": fit.data_sha256,
+        "commit": commit,
+        "device": device_name(device),
+        "threads": torch.get_num_threads(),
+        "wall_s": round(fit.wall_s, 1),
+        "data": data_statistics(task, episodes, recipe.horizon),
+    }
+    sample = windows[torch.linspace(0, len(windows.starts) - 1, SAMPLES).long()].double()
+    tensors = {f"net.{name}": value.cpu().contiguous() for name, value in fit.ema.state_dict().items()}
+    tensors |= {"normaliser.centre": normaliser.centre, "normaliser.scale": normaliser.scale}
+    tensors |= {"demonstrations": normaliser.decode(sample).float()}
+    return save_checkpoint(work / "model.safetensors", tensors, card)
+
+
+def end_pins(horizon: int, dim: int) -> Tensor:
+    """Mask [horizon, dim] of the coordinates given clean in training: the whole first and last state."""
+    pinned = torch.zeros(horizon, dim, dtype=torch.bool)
+    pinned[[0, -1]] = True
+    return pinned
+
+
+@dataclass
+class _Fit:
+    """All that changes in training; exactly what is saved."""
+
+    net: TemporalUnet
+    ema: TemporalUnet
+    optimiser: torch.optim.Adam
+    generator: torch.Generator
+    spec: TrainSpec
+    device: torch.device
+    seed: int
+    data_sha256: str
+    step: int = 0
+    loss_average: float = math.nan
+    mse_average: float = math.nan
+    wall_s: float = 0.0
+
+    @classmethod
+    def start(cls, dim: int, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)  # weight initialisation draws from the global generator; fork_rng restores it
+            net, ema = (TemporalUnet(dim, spec.network.width, spec.network.multipliers) for _ in range(2))
+        ema.load_state_dict(net.state_dict())
+        net, ema = net.to(device), ema.to(device).requires_grad_(False)
+        optimiser = torch.optim.Adam(net.parameters(), spec.learning_rate)
+        return cls(net, ema, optimiser, torch.Generator().manual_seed(seed), spec, device, seed, data_sha256)
+
+    def advance(self, windows: Windows, schedule: Schedule, pinned: Tensor) -> float:
+        """One optimiser step; returns the loss."""
+        spec, loss_value, mse_value = self.spec, 0.0, 0.0
+        for group in self.optimiser.param_groups:
+            group["lr"] = spec.learning_rate * self._rate()
+        self.optimiser.zero_grad()
+        for _ in range(spec.accumulate):
+            x0 = windows.draw(spec.batch, self.generator).to(self.device)
+            loss, mse = training_loss(self.net, schedule, x0, pinned, spec.smoothness, self.generator, spec.bf16)
+            (loss / spec.accumulate).backward()  # type: ignore[no-untyped-call]
+            loss_value, mse_value = loss_value + loss.item() / spec.accumulate, mse_value + mse.item() / spec.accumulate
+        if not math.isfinite(loss_value):
+            raise CdiffError(f"the loss is {loss_value} at step {self.step}: training diverged; lower learning_rate")
+        if spec.clip is not None:
+            nn.utils.clip_grad_norm_(self.net.parameters(), spec.clip)
+        self.optimiser.step()
+        self.step += 1
+        decay = min(spec.ema, self.step / (self.step + 10))
+        with torch.no_grad():
+            for mean, new in zip(self.ema.parameters(), self.net.parameters(), strict=True):
+                mean.lerp_(new, 1 - decay)
+        self.loss_average = _average(self.loss_average, loss_value)
+        self.mse_average = _average(self.mse_average, mse_value)
+        return loss_value
+
+    def _rate(self) -> float:
+        """Learning rate as a share of the recipe's: a short warm-up, then a cosine to zero."""
+        warm = min(1.0, (self.step + 1) / 200)
+        return warm if self.spec.schedule == "constant" else warm * (0.5 + 0.5 * math.cos(math.pi * self.step / self.spec.steps))
+
+    def save(self, path: Path) -> None:
+        tensors = {f"net.{k}": v for k, v in self.net.state_dict().items()}
+        tensors |= {f"ema.{k}": v for k, v in self.ema.state_dict().items()}
+        for index, state in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"adam.{index}.{k}": v for k, v in state.items()}
+        tensors["generator"] = self.generator.get_state()
+        facts = {k: str(getattr(self, k)) for k in ("step", "loss_average", "mse_average", "wall_s", "seed", "data_sha256")}
+        facts["spec"] = self.spec.model_dump_json()
+        write_safetensors(path, {k: v.cpu().contiguous() for k, v in tensors.items()}, facts)
+
+    def load(self, path: Path) -> None:
+        tensors, facts = read_safetensors(path, "start without --resume to train from the beginning")
+        for name, mine in (("seed", str(self.seed)), ("data_sha256", self.data_sha256), ("spec", self.spec.model_dump_json())):
+            if facts.get(name) != mine:
+                raise CheckpointError(
+                    f"{shown(path)}: its {name} is {facts.get(name)}, this training has {mine}; train without --resume, or as before"
+                )
+        self.net.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("net.")})
+        self.ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
+        adam = self.optimiser.state_dict()
+        for name, value in tensors.items():
+            if name.startswith("adam."):
+                _, index, key = name.split(".")
+                adam["state"].setdefault(int(index), {})[key] = value
+        self.optimiser.load_state_dict(adam)
+        self.generator.set_state(tensors["generator"])
+        self.step = int(facts["step"])
+        self.loss_average, self.mse_average = float(facts["loss_average"]), float(facts["mse_average"])
+        self.wall_s = float(facts["wall_s"])
+
+
+def _average(old: float, new: float) -> float:
+    return new if math.isnan(old) else 0.999 * old + 0.001 * new
+
+
+def data_statistics(task: Task, episodes: list[Any], horizon: int) -> dict[str, float]:
+    """What plans are held against: jumps between waypoints, accelerations, mean speeds over one horizon."""
+    at = [task.layout.index(name) for name in task.positions]
+    jump = np.concatenate([np.linalg.norm(np.diff(e[:, at], axis=0), axis=1) for e in episodes])
+    facts = {"jump_q999": np.quantile(jump, 0.999), "jump_max": jump.max()}
+    if task.velocities:
+        rate = [task.layout.index(name) for name in task.velocities]
+        change = np.concatenate([np.linalg.norm(np.diff(e[:, rate], axis=0), axis=1) for e in episodes]) / task.dt
+        facts |= {"acceleration_q999": np.quantile(change, 0.999), "acceleration_max": change.max()}
+    travelled = [np.convolve(np.linalg.norm(np.diff(e[:, at], axis=0), axis=1), np.ones(horizon - 1), "valid") for e in episodes]
+    speed = np.concatenate(travelled) / ((horizon - 1) * task.dt)
+    facts |= {"speed_q50": np.quantile(speed, 0.5), "speed_q95": np.quantile(speed, 0.95), "speed_max": speed.max()}
+    return {name: round(float(value), 5) for name, value in facts.items()}
+
+
+# checkpoints ----------------------------------------------------------------------------------------------------------
+
+
+def write_safetensors(path: Path, tensors: dict[str, Tensor], facts: dict[str, str] | None = None) -> None:
+    """Written beside its place and renamed, so that a reader never meets half a file."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(tensors, partial, facts)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_safetensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.exists():
+        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
+    try:
+        with safe_open(path, "pt") as file:
+            facts = dict(file.metadata() or {})
+        return load_file(path), facts
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{shown(path)}: damaged or not a checkpoint ({error}); {advice}") from None
+
+
+def save_checkpoint(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> Checkpoint:
+    """Weights, then the card that vouches for them."""
+    write_safetensors(path, tensors)
+    card |= {"weights_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    text = yaml.safe_dump(Card(**card).model_dump(mode="json"), sort_keys=False)
+    partial = card_path(path).with_name(f".{card_path(path).name}.{os.getpid()}")
+    partial.write_text(text)
+    os.replace(partial, card_path(path))
+    return load_checkpoint(path)
+
+
+def card_path(path: Path) -> Path:
+    return path.with_name(path.name.removesuffix(".safetensors") + ".card.yaml")
+
+
+def install(checkpoint: Checkpoint) -> Path:
+    """Put a finished checkpoint where `cdiff plan` looks; the one that stood there is kept as <recipe>.previous."""
+    folder = home() / "models" / checkpoint.card.task
+    target = folder / f"{checkpoint.card.recipe}.safetensors"
+    if target.exists():
+        previous = folder / f"{checkpoint.card.recipe}.previous.safetensors"
+        os.replace(card_path(target), card_path(previous))
+        os.replace(target, previous)
+    tensors, _ = read_safetensors(checkpoint.path, "train again")
+    save_checkpoint(target, tensors, checkpoint.card.model_dump(mode="json"))
+    return target
+
+
+def load_checkpoint(path: Path, task: str | None = None, device: torch.device | str = "cpu") -> Checkpoint:
+    """A checkpoint with its card; CheckpointError where either is missing, damaged, or of another task."""
+    from cdiff_cli.config import load
+
+    advice = f"train one with `cdiff train --task {task or path.parent.name}`, or name another with --checkpoint"
+    if not path.exists():
+        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
+    if not card_path(path).exists():
+        raise CheckpointError(f"{shown(card_path(path))}: the checkpoint's card is missing; {advice}")
+    card = load(card_path(path), Card)
+    if task is not None and card.task != task:
+        raise CheckpointError(f"{shown(path)}: a checkpoint of {card.task}, asked for was {task}; {advice}")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found != card.weights_sha256:
+        raise CheckpointError(
+            f"{shown(path)}: truncated or altered: sha256 {found[:12]}..., its card says {card.weights_sha256[:12]}...; "
+            f"restore it, or {advice}"
+        )
+    tensors, _ = read_safetensors(path, advice)
+    normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
+    windows = tensors.pop("demonstrations")
+    net = TemporalUnet(windows.shape[-1], card.network.width, card.network.multipliers)
+    net.load_state_dict({name.removeprefix("net."): value for name, value in tensors.items()})
+    return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path)
+
+
+def network_spec(checkpoint: Checkpoint) -> NetworkSpec:
+    return checkpoint.card.network
+
+
+def git_commit() -> str:
+    """The checkout's commit, with '+' where files differ from it; 'none' outside a checkout."""
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        run = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
+        return subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip()
+    return "none"
+
+
+def device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({torch.get_num_threads()} threads)"
