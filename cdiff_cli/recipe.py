@@ -29,7 +29,7 @@ class TrainSpec(Strict):
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     schedule: str = Field("cosine", pattern="^(cosine|constant)$")
     ema: Annotated[float, Field(ge=0, lt=1)] = 0.995
-    smoothness: Annotated[float, Field(ge=0)] = 10.0
+    smoothness: Annotated[float, Field(ge=0)] = 100.0
     trips: Annotated[float, Field(ge=0, le=1)] = 0.5
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
