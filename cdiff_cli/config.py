@@ -1,6 +1,5 @@
 """YAML files into pydantic models, with errors that name file, line and field."""
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,7 +7,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from cdiff_cli.errors import SpecError
+from cdiff_cli.errors import SpecError, suggestion
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -112,8 +111,7 @@ def _explain(error: dict[str, Any]) -> str:
         return "no such field here; remove it or mend its name"
     if kind == "union_tag_invalid":
         tag, known = str(context.get("tag")), str(context.get("expected_tags"))
-        close = difflib.get_close_matches(tag, known.replace("'", "").split(", "), 1)
-        return f'no kind "{tag}"{f" (did you mean {close[0]!r}?)" if close else ""}; expected one of {known}'
+        return f'no kind "{tag}"{suggestion(tag, known.replace("'", "").split(", "))}; expected one of {known}'
     if kind == "union_tag_not_found":
         return "it has no kind; add `kind: linear`, `quadratic` or `dcbf`"
     if kind == "value_error":

@@ -145,7 +145,7 @@ def _project_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
     unit = radial / length.clamp_min(1e-12)
     unit[..., 0] = torch.where(length[..., 0] > 1e-12, unit[..., 0], 1.0)
     h = length[..., 0] / level.axes[0] - 1  # in units of the radius: the same chain
-    fixed = (pins.mask @ level.which.T.bool().to(pins.mask) if False else pins.mask[:, level.which.argmax(1)]).any(1)
+    fixed = pins.mask[:, level.which.argmax(1)].any(1)
     target = nearest_chain(h, gamma, torch.ones_like(h[0]), fixed)
     step = (target - h).clamp_min(-(h + 1)) * level.axes[0]
     return z + (step[..., None] * unit) @ level.which

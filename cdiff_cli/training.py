@@ -19,10 +19,10 @@ from torch import Tensor, nn
 
 from cdiff_cli.data import Normaliser, Progress, Windows, demonstrations, digest, load_dataset
 from cdiff_cli.diffusion import Schedule, training_loss
-from cdiff_cli.errors import CdiffError, CheckpointError
+from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.networks import TemporalUnet
 from cdiff_cli.recipe import Card, NetworkSpec, Recipe, TrainSpec, home, shown
-from cdiff_cli.tasks import Task, suggestion
+from cdiff_cli.tasks import Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
 

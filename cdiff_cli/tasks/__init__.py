@@ -1,6 +1,5 @@
 """The environments: a literal table from name to module, and what every task offers."""
 
-import difflib
 import importlib
 from collections.abc import Iterator
 from typing import Any, Protocol
@@ -8,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cdiff_cli.errors import CdiffError
+from cdiff_cli.errors import CdiffError, suggestion
 
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
@@ -71,8 +70,3 @@ def load_task(name: str) -> Any:
     module, attribute = TASKS[name].split(":")
     return getattr(importlib.import_module(module), attribute)
 
-
-def suggestion(name: str, known: Any) -> str:
-    """', did you mean "x"?' for the closest known name, or nothing."""
-    close = difflib.get_close_matches(name, list(known), 1, 0.5)
-    return f' (did you mean "{close[0]}"?)' if close else ""

@@ -37,7 +37,7 @@ class Maze2D:
     velocities = ("vx", "vy")
     shared_scale = (("x", "y"), ("vx", "vy"))
     dt = DT
-    pinned = "start and goal"
+    success_radius = SUCCESS_RADIUS
 
     def make_env(self, render: bool = False, max_steps: int = 10**9) -> Any:
         """The Gymnasium environment, continuing (it never resets the goal by itself)."""
@@ -56,6 +56,20 @@ class Maze2D:
     def observe(self, obs: Any) -> Array:
         """State (x, y, vx, vy) of an observation, or of a whole episode of observations."""
         return np.asarray(obs["observation"] if isinstance(obs, dict) else obs, dtype=np.float64)
+
+    def reset_to(self, env: Any, start: Array, goal: Array, seed: int) -> Any:
+        """Put the ball into a state, the goal at another; returns the observation."""
+        env.reset(seed=seed)
+        env.goal = goal[:2].copy()
+        env.update_target_site_pos()
+        env.point_env.set_state(start[:2].copy(), start[2:].copy())
+        state, _ = env.point_env._get_obs()
+        return env._get_obs(state)
+
+    def track(self, state: Array, target: Array) -> Array:
+        """Force of the waypoint controller: 20 (p' - p) + 2 (v' - v), clipped to [-1, 1]."""
+        error = target - state
+        return np.clip(20.0 * error[:2] + 2.0 * error[2:], -1.0, 1.0).astype(np.float32)
 
     def from_d4rl(self, states: Array) -> Array:
         """D4RL's (row, column, their rates), whose cells lie 0.2 lower, as (x, y, vx, vy)."""

@@ -1,0 +1,224 @@
+"""The methods: how each reverse step obeys g(x) <= 0. Read beside the paper, section 4.
+
+Every method is the plain step x_{t-1} = reverse(x0) with two holes: the clean estimate x0 may be changed before it, the
+sample after it. `on` says where g is evaluated and where the change is made:
+
+noisy   at x_t, the change made to x_{t-1}: the paper's
+clean   at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, NamedTuple, get_args, get_type_hints
+
+import torch
+from torch.nn import functional as F
+
+from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
+from cdiff_cli.diffusion import Method, Step
+from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.projection import project
+
+On = Literal["noisy", "clean"]
+Expectation = Literal["per_sample", "batch_mean"]
+Positive = Literal["none", "silu"]
+Coefficient = Literal["beta/2", "one"]
+
+
+@dataclass(frozen=True)
+class Unconstrained:
+    """Diffuser: x_{t-1} = reverse(x0), constraints ignored."""
+
+    def init(self, x: Traj, g: Constraint) -> None:  # noqa: ARG002
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:  # noqa: ARG002
+        return step.reverse(step.x0), state
+
+
+@dataclass(frozen=True)
+class Projected:
+    """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean."""
+
+    on: On = "clean"
+
+    def init(self, x: Traj, g: Constraint) -> None:  # noqa: ARG002
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        if self.on == "clean":
+            return step.reverse(project(g, step.x0, step.pins)), state
+        return project(g, step.reverse(step.x0), step.pins), state
+
+
+@dataclass(frozen=True)
+class PrimalDual:
+    """Multipliers lam climb with the violation; the sample descends lam^T g.
+
+    noisy:  x_{t-1} = reverse(x0) - c_t lam_t^T dg(x_t)               (paper, Eq. pri)
+            lam_{t-1} = [lam_t + eta E g(x_t)]_+                      (paper, Eq. dual)
+    clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
+
+    eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
+    coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
+    expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
+    positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
+    """
+
+    on: On = "clean"
+    eta: float = 1.0
+    coefficient: Coefficient = "beta/2"
+    expectation: Expectation = "per_sample"
+    positive: Positive = "none"
+
+    def init(self, x: Traj, g: Constraint) -> Rows:
+        return zeros(x, g, self.expectation)
+
+    def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
+        lam = state
+        if self.on == "noisy":
+            rows, pull, _ = linearise(g, step.x, self.positive)
+            push = step.pins.free(pull(spread(lam, rows)))
+            x = step.reverse(step.x0) - weight(self.coefficient, step) * push
+            return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
+        rows, pull, size = linearise(g, step.x0, self.positive)
+        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        rows, _, size = linearise(g, x0, self.positive)
+        dual = expect(rows / size.clamp_min(1e-12), self.expectation)
+        return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)
+
+
+class AlmState(NamedTuple):
+    """Multipliers [batch or 1, n] and the penalty weight."""
+
+    lam: Rows
+    rho: float
+
+
+@dataclass(frozen=True)
+class AugmentedLagrangian:
+    """Primal-dual that descends the fresh multiplier and lets the penalty grow (paper, section 4.3).
+
+    s_t = [-E g - lam_t / rho_t]_+,  m = lam_t + rho_t (E g + s_t) = [lam_t + rho_t E g]_+
+    noisy:  g at x_t,  x_{t-1} = reverse(x0) - c_t m^T dg(x_t)
+    clean:  g at x0 - lam_t^T dg(x0), the estimate as the multipliers known so far push it;
+            x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
+    lam_{t-1} = m,  rho_{t-1} = c rho_t
+
+    rho          first penalty weight; on clean in units of the exact one, kept at most 1, where one half-space is met at once
+    c            its growth a step
+    inner        rounds a step on clean: 1 is exact where each row moves its own waypoint, coupled rows need more
+    coefficient, expectation, positive   as in PrimalDual
+    """
+
+    on: On = "clean"
+    rho: float = 0.5
+    c: float = 1.02
+    inner: int = 1
+    coefficient: Coefficient = "beta/2"
+    expectation: Expectation = "per_sample"
+    positive: Positive = "none"
+
+    def init(self, x: Traj, g: Constraint) -> AlmState:
+        return AlmState(zeros(x, g, self.expectation), self.rho)
+
+    def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
+        lam, rho = state
+        if self.on == "noisy":
+            rows, pull, _ = linearise(g, step.x, self.positive)
+            m = multiplier(expect(rows, self.expectation), lam, rho)
+            push = step.pins.free(pull(spread(m, rows)))
+            return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
+        rows, pull, _ = linearise(g, step.x0, self.positive)
+        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        for _ in range(self.inner):
+            rows, pull, size = linearise(g, x0, self.positive)
+            lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
+            x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        return step.reverse(x0), AlmState(lam, min(self.c * rho, max(self.rho, 1.0)))
+
+
+METHODS: dict[str, type[Method]] = {
+    "diffuser": Unconstrained,
+    "projected": Projected,
+    "primal-dual": PrimalDual,
+    "alm": AugmentedLagrangian,
+}
+
+
+def make_method(name: str, settings: Mapping[str, Any]) -> Method:
+    """The method of that name with those hyper-parameters; CdiffError where either does not exist or is out of range."""
+    if name not in METHODS:
+        raise CdiffError(f'no method "{name}"{suggestion(name, METHODS)}; choose from {", ".join(METHODS)}')
+    kind = METHODS[name]
+    hints = get_type_hints(kind)
+    known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
+    values = {}
+    for key, value in settings.items():
+        if key not in known:
+            has = ", ".join(known) or "none"
+            raise CdiffError(f'{name} has no setting "{key}"{suggestion(key, known)}; its settings are: {has}')
+        values[key] = _typed(f"{name}.{key}", value, hints[key])
+    return kind(**values)
+
+
+def slack(g: Rows, lam: Rows, rho: float) -> Rows:
+    """Slack that closes g + s = 0 for the rows already satisfied.
+
+    Paper, slack update:  s_t = [-E g(x_t) - lam_t / rho_t]_+
+
+    g    E g(x_t), environment units, negative where satisfied   [batch, n]
+    lam  multipliers, 1 / units of g, never negative             [batch, n]
+    rho  penalty weight, > 0
+    """
+    return (-g - lam / rho).clamp_min(0)
+
+
+def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
+    """lam + rho (g + s) with the slack above, which is [lam + rho g]_+ (tests/test_methods.py shows they are equal)."""
+    return (lam + rho * g).clamp_min(0)
+
+
+def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
+    """g(x), its pull w -> w^T dg/dx and row sizes |dg/dx|^2, of g itself or of its smooth positive part g / (1 + e^-g)."""
+    rows, pull, size = g.linearise(x)
+    if positive == "none":
+        return rows, pull, size
+    gate = torch.sigmoid(rows)
+    slope = gate * (1 + rows * (1 - gate))
+    return F.silu(rows), lambda w: pull(w * slope), size
+
+
+def zeros(x: Traj, g: Constraint, expectation: Expectation) -> Rows:
+    n = g(x[:1]).shape[1]
+    return x.new_zeros(1 if expectation == "batch_mean" else len(x), n)
+
+
+def expect(rows: Rows, expectation: Expectation) -> Rows:
+    """E g: the rows themselves, one multiplier vector a plan, or their mean over the batch [1, n]."""
+    return rows if expectation == "per_sample" else rows.mean(0, keepdim=True)
+
+
+def spread(lam: Rows, rows: Rows) -> Rows:
+    """Shared multipliers handed to every plan."""
+    return lam.expand_as(rows)
+
+
+def weight(coefficient: Coefficient, step: Step) -> float:
+    return step.beta / 2 if coefficient == "beta/2" else 1.0
+
+
+def _typed(where: str, value: Any, hint: Any) -> Any:
+    """The value as the field's type wants it, from YAML or from a --set string."""
+    if choices := get_args(hint):
+        if value not in choices:
+            raise CdiffError(f"{where}: expected one of {', '.join(choices)}, found {value!r}")
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise CdiffError(f"{where}: expected a number, found {value!r}") from None
+    if not 0 < number < float("inf") or (hint is int and number != int(number)):
+        raise CdiffError(f"{where}: expected a positive {'whole ' if hint is int else ''}number, found {value}")
+    return hint(number)
+

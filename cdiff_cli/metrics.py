@@ -1,0 +1,167 @@
+"""Every reported number, as a pure function of saved arrays in environment units, float64. Definitions: README, Metrics.
+
+x is always [n, horizon, dim]; g is the compiled constraint in environment units, positive where unsafe.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cdiff_cli.constraint import Constraint, Opaque
+from cdiff_cli.tasks import Task
+
+Array = NDArray[np.float64]
+
+
+def violation(g: Constraint, x: Array) -> Array:
+    """Sum over waypoints and rows of [g]_+ [n]: the paper's total violation."""
+    return _rows(g, x).clamp_min(0).nan_to_num(0.0).sum(1).numpy()
+
+
+def worst_waypoint(g: Constraint, x: Array) -> Array:
+    """Largest g over all rows [n]; positive is unsafe."""
+    return _largest(_rows(g, x)).numpy()
+
+
+def worst_segment(g: Constraint, x: Array) -> Array:
+    """Largest g on the straight segments between waypoints [n], exact for half-spaces, quadrics, balls and ellipsoids."""
+    each = [part.segment_max(torch.from_numpy(x)) for part in g.parts]
+    return _largest(torch.cat(each, 1) if each else torch.empty(len(x), 0, dtype=torch.float64)).numpy()
+
+
+def distance(x: Array, x_free: Array, columns: Sequence[int], power: float = 1.0) -> Array:
+    """Sum over waypoints of |position - position of x_free| ** power [n]; x_free broadcasts (the paper's mean plan)."""
+    length: Array = np.linalg.norm((x - x_free)[..., columns], axis=-1)
+    return np.asarray((length**power).sum(-1))
+
+
+def jump(x: Array, columns: Sequence[int]) -> Array:
+    """Largest distance between neighbouring waypoints [n]."""
+    return _steps(x, columns).max(-1, initial=0.0)
+
+
+def mean_speed(x: Array, columns: Sequence[int], dt: float) -> Array:
+    """Length of the path over its duration [n]."""
+    return np.asarray(_steps(x, columns).sum(-1) / (dt * max(x.shape[1] - 1, 1)))
+
+
+def residual(x: Array, positions: Sequence[int], velocities: Sequence[int], dt: float) -> Array:
+    """Mean over waypoints of |p' - p - v' dt| [n]: how far positions and velocities contradict each other."""
+    gap = np.diff(x[..., positions], axis=1) - dt * x[:, 1:][..., velocities]
+    return np.asarray(np.linalg.norm(gap, axis=-1).mean(-1))
+
+
+def acceleration(x: Array, velocities: Sequence[int], dt: float) -> Array:
+    """Largest |v' - v| / dt [n]."""
+    return np.asarray(_steps(x, velocities).max(-1, initial=0.0) / dt)
+
+
+def hits_wall(x: Array, columns: Sequence[int], boxes: Array) -> NDArray[np.bool_]:
+    """Whether a waypoint or a segment between waypoints enters a box (x_min, y_min, x_max, y_max) [n]."""
+    if len(boxes) == 0 or x.shape[1] < 2:
+        return np.zeros(len(x), dtype=bool)
+    hit = np.zeros(len(x), dtype=bool)
+    p = x[:, :-1][..., columns]
+    d = x[:, 1:][..., columns] - p
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for box in boxes:  # slab test: the segment is inside while it is between both pairs of sides
+            near, far = (box[:2] - p) / d, (box[2:] - p) / d
+            still = d == 0
+            between = (p > box[:2]) & (p < box[2:])
+            enter = np.where(still, np.where(between, -np.inf, np.inf), np.minimum(near, far)).max(-1)
+            leave = np.where(still, np.where(between, np.inf, -np.inf), np.maximum(near, far)).min(-1)
+            hit |= (np.maximum(enter, 0) < np.minimum(leave, 1)).any(1)
+    return hit
+
+
+def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units: Any) -> list[dict[str, float]]:
+    """The metrics of each plan."""
+    at = [task.layout.index(name) for name in task.positions]
+    columns: dict[str, Array] = {
+        "violation": violation(g, x),
+        "worst_waypoint": worst_waypoint(g, x),
+        "worst_segment": worst_segment(g, x),
+        "distance": distance(x, x_free, at),
+        "violation_paper": violation(g, x) * paper_units.violation,
+        "distance_paper": distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power),
+        "jump": jump(x, at),
+    }
+    if task.velocities:
+        rate = [task.layout.index(name) for name in task.velocities]
+        columns |= {
+            "mean_speed": mean_speed(x, at, task.dt),
+            "residual": residual(x, at, rate, task.dt),
+            "acceleration": acceleration(x, rate, task.dt),
+            "wall": hits_wall(x, at, task.walls()).astype(np.float64),
+        }
+    return [{name: float(values[i]) for name, values in columns.items()} for i in range(len(x))]
+
+
+def rollout_metrics(g: Constraint, x: Array, reward: Array, success: Array, goal_distance: Array) -> list[dict[str, float]]:
+    """The metrics of each executed episode; states after its end are NaN."""
+    rows = _rows(g, x)
+    steps = np.isfinite(x).all(-1).sum(1) - 1
+    unsafe = np.stack([_unsafe_states(part, x) for part in g.parts]).any(0) if g.parts else np.zeros(x.shape[:2], dtype=bool)
+    return [
+        {
+            "reward": float(np.nansum(reward[i])),
+            "executed_violation": float(rows[i].clamp_min(0).nan_to_num(0.0).sum()),
+            "executed_worst": float(_largest(rows[i : i + 1])[0]),
+            "violation_rate": 100.0 * float(unsafe[i].sum()) / max(int(steps[i]) + 1, 1),
+            "steps": float(steps[i]),
+            "success": float(success[i]),
+            "goal_distance": float(goal_distance[i]),
+        }
+        for i in range(len(x))
+    ]
+
+
+def certificate(g: Constraint, x: Array, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """For each plan and constraint the worst value at waypoints and along segments, where, and whether it is exact."""
+    xs = torch.from_numpy(x)
+    found = [(part, part(xs), part.segment_max(xs), part.labels(x.shape[1])) for part in g.parts]
+    return [
+        {
+            "seed": int(seed),
+            "constraint": part.name,
+            "worst_waypoint": float(rows[i].max()) if rows.shape[1] else None,
+            "at": labels[int(rows[i].argmax())] if rows.shape[1] else None,
+            "worst_segment": float(between[i].max()),
+            "segment": int(between[i].argmax()),
+            "segment_bound_exact": not isinstance(part, Opaque),
+            "safe_at_waypoints": bool((rows[i] <= 0).all()),
+            "safe_on_segments": bool((between[i] <= 0).all()),
+        }
+        for i, seed in enumerate(seeds)
+        for part, rows, between, labels in found
+    ]
+
+
+def boundary_mass(g: Constraint, x: Array, within: float) -> float:
+    """Share of samples at most `within` inside the boundary of the allowed set (0 <= -g <= within, or unsafe)."""
+    return float((_rows(g, x).amax(1) >= -within).double().mean())
+
+
+def _rows(g: Constraint, x: Array) -> torch.Tensor:
+    return g(torch.from_numpy(np.ascontiguousarray(x, dtype=np.float64)))
+
+
+def _largest(rows: torch.Tensor) -> torch.Tensor:
+    """Largest entry of each row, NaN left out; -inf where there is none."""
+    if rows.shape[1] == 0:
+        return torch.full((len(rows),), -torch.inf, dtype=torch.float64)
+    return rows.nan_to_num(-torch.inf, posinf=torch.inf, neginf=-torch.inf).amax(1)
+
+
+def _steps(x: Array, columns: Sequence[int]) -> Array:
+    return np.asarray(np.linalg.norm(np.diff(x[..., columns], axis=1), axis=-1))
+
+
+def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
+    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0."""
+    level = getattr(part, "level", None)
+    values = level(torch.from_numpy(x)) if level is not None else part(torch.from_numpy(x)).amax(1, keepdim=True)
+    return np.broadcast_to((values > 0).numpy(), x.shape[:2])

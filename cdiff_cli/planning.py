@@ -1,0 +1,246 @@
+"""From a request to plans, and from plans to executed episodes."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cdiff_cli.constraint import Constraint, Pins, Traj, pull_back
+from cdiff_cli.data import Normaliser
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step, sample
+from cdiff_cli.errors import CdiffError, InfeasibleError
+from cdiff_cli.methods import Unconstrained
+from cdiff_cli.projection import project
+from cdiff_cli.tasks import Task
+
+Array = NDArray[np.float64]
+MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that sampling needs, resolved.
+
+    g            environment units
+    start, goal  pinned states [dim], or None
+    clip         clean estimates are clipped to [-1, 1] (trained networks)
+    """
+
+    task: Task
+    horizon: int
+    denoiser: Denoiser
+    schedule: Schedule
+    normaliser: Normaliser
+    g: Constraint
+    start: Array | None
+    goal: Array | None
+    device: torch.device
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Plans of one batch and what making them took.
+
+    x              [n, horizon, dim] float64, environment units
+    trace          total violation a plan by network call: of x_t, of its clean estimate   [calls, 2, n]
+    chain          every x_t, kept where small   [calls + 1, n, horizon, dim] or None
+    polish         largest displacement by the final polish, environment units   [n]
+    calls          network calls a plan
+    total_s, network_s   wall time of the batch, and the network's part of it
+    """
+
+    x: Array
+    trace: Array
+    chain: Array | None
+    polish: Array
+    calls: int
+    total_s: float
+    network_s: float
+
+
+def network_denoiser(net: torch.nn.Module) -> Denoiser:
+    """x_t, t -> the network's clean estimate, clipped to the data's limits."""
+
+    def clean(x: Traj, t: int) -> Traj:
+        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-1.0, 1.0)
+
+    return clean
+
+
+def check_feasible(problem: Problem) -> None:
+    """Refuse a start or goal inside a wall or outside the constraints, before anything is sampled."""
+    columns = [problem.task.layout.index(name) for name in problem.task.positions]
+    for name, state in (("start", problem.start), ("goal", problem.goal)):
+        if state is None:
+            continue
+        point = ", ".join(f"{c} = {v:g}" for c, v in zip(problem.task.positions, state[columns], strict=True))
+        is_free = getattr(problem.task, "is_free", None)
+        if is_free is not None and not is_free(state[columns], 0.1):
+            raise CdiffError(f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}")
+        x = torch.from_numpy(np.broadcast_to(state, (1, problem.horizon, len(state))).copy())
+        for part in problem.g.parts:
+            level = getattr(part, "level", None)
+            value = float(level(x).max()) if level is not None else 0.0
+            if value > 0:
+                raise InfeasibleError(
+                    f'the constraint "{part.name}" excludes the {name} ({point}): g = {value:.3g} there, must be <= 0; '
+                    f"move the {name} or relax the constraint"
+                )
+
+
+def plan(
+    problem: Problem,
+    method: Method,
+    seeds: Sequence[int],
+    *,
+    kernel: str = "ddpm",
+    extra_steps: int = 0,
+    polish: bool = False,
+    on_step: Callable[[int], None] | None = None,
+) -> Plans:
+    """One plan a seed. Equal seeds meet equal noise whatever the method, so differences between methods are paired."""
+    device, dim = problem.device, len(problem.task.layout)
+    scale, centre = problem.normaliser.scale, problem.normaliser.centre
+    like = torch.empty(0, device=device)
+    g = pull_back(problem.g, centre, scale).to(like)
+    pins = make_pins(problem, len(seeds))
+    shape = (problem.horizon, dim)
+    total = problem.schedule.n_steps + extra_steps
+    keep_chain = total * len(seeds) * problem.horizon * dim <= 4_000_000
+    trace, chain, network_s = [], [], 0.0
+
+    def timed(x: Traj, t: int) -> Traj:
+        nonlocal network_s
+        synchronise(device)
+        began = time.perf_counter()
+        x0 = problem.denoiser(x, t)
+        synchronise(device)
+        network_s += time.perf_counter() - began
+        return x0
+
+    def record(call: int, step: Step, x: Traj) -> None:
+        nonlocal watching_s
+        began = time.perf_counter()
+        trace.append(torch.stack([g(step.x).clamp_min(0).sum(1), g(step.x0).clamp_min(0).sum(1)]).cpu())
+        if keep_chain:
+            chain.append(step.x.cpu())
+            if call == total:
+                chain.append(x.cpu())
+        if on_step:
+            on_step(call)
+        watching_s += time.perf_counter() - began
+
+    watching_s = 0.0
+    synchronise(device)
+    began = time.perf_counter()
+    with torch.inference_mode():
+        noise = Noise(seeds, shape, device)
+        z = sample(
+            timed, problem.schedule, method, g, pins, noise, kernel=KERNELS[kernel], extra_steps=extra_steps, on_step=record
+        )
+        if not bool(torch.isfinite(z).all()):
+            bad = [seed for seed, x in zip(seeds, z, strict=True) if not bool(torch.isfinite(x).all())]
+            raise CdiffError(
+                f"the plans of seeds {bad[:5]} diverged to NaN or inf: the steps are too large for this kernel; "
+                "lower eta, rho or c with --set, or use --preset recommended"
+            )
+        z64 = z.double().cpu()
+        moved = np.zeros(len(seeds))
+        if polish and not isinstance(method, Unconstrained):
+            z64, moved = polish_plans(problem, z64)
+        x = problem.normaliser.decode(z64).numpy()
+    synchronise(device)
+    total_s = time.perf_counter() - began - watching_s
+    whole = torch.stack(chain) if chain else None
+    return Plans(
+        x=x,
+        trace=torch.stack(trace).double().numpy() if trace else np.empty((0, 2, len(seeds))),
+        chain=None if whole is None else problem.normaliser.decode(whole.double()).numpy(),
+        polish=moved,
+        calls=total,
+        total_s=total_s,
+        network_s=network_s,
+    )
+
+
+def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array]:
+    """Project finished plans in float64 onto the constraints tightened by MARGIN; also the largest displacement [n]."""
+    g = pull_back(problem.g.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
+    pins = make_pins(problem, len(z), torch.float64, torch.device("cpu"))
+    out = project(g, z, pins)
+    columns = [problem.task.layout.index(name) for name in problem.task.positions]
+    shift = (problem.normaliser.scale * (out - z))[..., columns].norm(dim=-1).amax(1)
+    return out, shift.numpy()
+
+
+def make_pins(problem: Problem, n: int, dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Pins:
+    """The start as the first waypoint, the goal as the last, in normalised coordinates."""
+    dim = len(problem.task.layout)
+    mask = torch.zeros(problem.horizon, dim, dtype=torch.bool)
+    values = torch.zeros(n, problem.horizon, dim, dtype=torch.float64)
+    for index, state in ((0, problem.start), (-1, problem.goal)):
+        if state is not None:
+            mask[index] = True
+            values[:, index] = problem.normaliser.encode(torch.from_numpy(state))
+    device = problem.device if device is None else device
+    return Pins(mask.to(device), values.to(device, dtype))
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait for the device, so that a clock read afterwards counts its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+# execution ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Executed episodes.
+
+    x [n, steps + 1, dim], u [n, steps, m], reward [n, steps], success [n], goal_distance [n] at the end
+    """
+
+    x: Array
+    u: Array
+    reward: Array
+    success: NDArray[np.bool_]
+    goal_distance: Array
+
+
+def follow(
+    task: Any, plans: Array, seeds: Sequence[int], hold: int = 100, on_step: Callable[[int], None] | None = None
+) -> Rollout:
+    """Follow each plan in the task's environment with its tracking controller, then hold at the last waypoint."""
+    env = task.make_env().unwrapped
+    episodes: list[Mapping[str, Array]] = []
+    for number, (x, seed) in enumerate(zip(plans, seeds, strict=True)):
+        obs = task.reset_to(env, x[0], x[-1], seed)
+        states, actions, rewards = [task.observe(obs)], [], []
+        for tau in range(len(x) - 1 + hold):
+            u = task.track(states[-1], x[min(tau + 1, len(x) - 1)])
+            obs, reward, *_ = env.step(u)
+            states.append(task.observe(obs))
+            actions.append(u)
+            rewards.append(float(reward))
+            if not np.isfinite(states[-1]).all():
+                raise CdiffError(f"the simulation of seed {seed} diverged at step {tau}; its state is not finite")
+        episodes.append({"x": np.stack(states), "u": np.stack(actions).astype(np.float64), "reward": np.array(rewards)})
+        if on_step:
+            on_step(number + 1)
+    env.close()
+    executed = np.stack([e["x"] for e in episodes])
+    columns = [task.layout.index(name) for name in task.positions]
+    left = np.linalg.norm((executed[:, -1] - plans[:, -1])[:, columns], axis=1)
+    return Rollout(
+        x=executed,
+        u=np.stack([e["u"] for e in episodes]),
+        reward=np.stack([e["reward"] for e in episodes]),
+        success=left <= task.success_radius,
+        goal_distance=left,
+    )

@@ -1,0 +1,191 @@
+"""A run is a directory: written under a temporary name, renamed when whole. Rows of many runs make the comparison."""
+
+import contextlib
+import csv
+import math
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from cdiff_cli.errors import CdiffError
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a metric is shown: heading with unit, digits, what it is."""
+
+    title: str
+    digits: int
+    meaning: str
+
+
+COLUMNS = {
+    "distance": Column("distance / m", 2, "sum over waypoints of |p - p_free|, p_free the unconstrained plan of the same noise"),
+    "violation": Column("violation / g", 4, "sum over waypoints and constraints of [g]_+, in the constraints' own units"),
+    "worst_waypoint": Column("worst waypoint / g", 4, "largest g at a waypoint; positive is unsafe"),
+    "worst_segment": Column("worst segment / g", 4, "largest g on the straight segments between waypoints"),
+    "jump": Column("jump / m", 4, "largest distance between neighbouring waypoints"),
+    "mean_speed": Column("speed / m/s", 2, "mean speed the plan asks for: its length over its duration"),
+    "residual": Column("residual / m", 5, "mean of |p' - p - v' dt|: positions against velocities"),
+    "acceleration": Column("acceleration / m/s^2", 1, "largest |v' - v| / dt"),
+    "wall": Column("in wall", 2, "share of plans with a waypoint or segment inside a wall"),
+    "polish": Column("polish / m", 5, "largest displacement by the final exact projection"),
+    "calls": Column("calls", 0, "network calls a plan"),
+    "plan_ms": Column("plan / ms", 1, "wall time of the batch over its number of plans"),
+    "step_ms": Column("step / ms", 2, "wall time of the batch over its network calls"),
+    "overhead": Column("overhead / %", 1, "time outside the network over time inside it"),
+    "violation_paper": Column("violation (paper)", 4, "violation in the paper's units"),
+    "distance_paper": Column("distance (paper)", 2, "the paper's definition: distance to the mean unconstrained plan"),
+    "reward": Column("return", 1, "sum of rewards"),
+    "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
+    "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
+    "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
+    "steps": Column("steps", 0, "environment steps"),
+    "success": Column("success", 2, "share of episodes that end within the environment's success radius of the goal"),
+    "goal_distance": Column("goal distance / m", 3, "distance to the goal at the end"),
+}
+KEYS = ("task", "constraints", "method", "preset")
+PLAN_TABLE = ("distance", "violation", "worst_waypoint", "worst_segment", "jump", "mean_speed", "calls", "plan_ms", "step_ms")
+ROLLOUT_TABLE = ("success", "executed_violation", "executed_worst", "violation_rate", "goal_distance", "reward", "steps")
+PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
+
+
+class NewRun:
+    """A run being written: `path` is the temporary directory, and the final one once the `new_run` block has ended."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+
+@contextlib.contextmanager
+def new_run(root: Path, name: str) -> Iterator[NewRun]:
+    """A directory to write a run into; it appears below root only when the block ends without an error."""
+    root.mkdir(parents=True, exist_ok=True)
+    stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+    partial = Path(tempfile.mkdtemp(prefix=f".{stem}-", dir=root))
+    run = NewRun(partial)
+    try:
+        yield run
+        partial.chmod(0o755)
+        run.path, number = root / stem, 1
+        while run.path.exists():
+            run.path, number = root / f"{stem}-{number}", number + 1
+        partial.rename(run.path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def latest(root: Path) -> Path | None:
+    """The newest finished run with rows under root."""
+    runs = [path.parent for path in find_rows(root)]
+    return max(runs, key=lambda path: (path.name[:15], path.stat().st_mtime)) if runs else None
+
+
+def find_rows(root: Path) -> list[Path]:
+    """All rows.csv below root, those of unfinished runs left out."""
+    return sorted(p for p in root.glob("*/rows.csv") if not p.parent.name.startswith("."))
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Rows with their metrics as numbers; CdiffError where the file is not one of ours."""
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise CdiffError(f"{path}: cannot be read: {error}") from None
+    for number, row in enumerate(rows, start=2):
+        if any(row.get(key) is None for key in KEYS):
+            raise CdiffError(f"{path}:{number}: not a row of a run: it lacks {', '.join(k for k in KEYS if row.get(k) is None)}")
+        for name in row:
+            if name in COLUMNS and row[name] not in ("", None):
+                try:
+                    row[name] = float(row[name])
+                except ValueError:
+                    raise CdiffError(f"{path}:{number}: {name} is not a number: {row[name]!r}") from None
+    return rows
+
+
+def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True))
+
+
+# the comparison -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Mean and standard error (sample standard deviation over sqrt(n)) of one metric of one group."""
+
+    mean: float
+    error: float
+    n: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Cell":
+        n = len(values)
+        error = statistics.stdev(values) / math.sqrt(n) if n > 1 else math.nan
+        return cls(statistics.fmean(values), error, n)
+
+    def text(self, digits: int) -> str:
+        mean = f"{self.mean:.{digits}f}"
+        mean = mean.lstrip("-") if float(mean) == 0 else mean
+        if self.n < 2 or (self.error == 0 and digits == 0):
+            return mean
+        return f"{mean} ± {self.error:.{digits}f}"
+
+
+@dataclass(frozen=True)
+class Group:
+    """All rows of one task, constraint file, method and preset, the newest row for each seed."""
+
+    key: tuple[str, ...]
+    n: int
+    cells: dict[str, Cell]
+
+
+def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> list[Group]:
+    """Groups in order of task, constraints, preset and method; one row a seed, the last given wins."""
+    newest: dict[tuple[str, ...], dict[str, Row]] = {}
+    for row in rows:
+        newest.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = row
+    groups = []
+    for key in sorted(newest, key=lambda k: (k[0], k[1], _order(PRESET_ORDER, k[3]), _order(METHOD_ORDER, k[2]))):
+        mine = list(newest[key].values())
+        names = metrics or [name for name in COLUMNS if any(isinstance(row.get(name), float) for row in mine)]
+        values = {name: [row[name] for row in mine if isinstance(row.get(name), float)] for name in names}
+        groups.append(Group(key, len(mine), {name: Cell.of(v) for name, v in values.items() if v}))
+    return groups
+
+
+METHOD_ORDER = ("diffuser", "guidance", "conditional", "safediffuser", "projected", "primal-dual", "alm")
+PRESET_ORDER = ("paper", "released", "recommended")
+
+
+def _order(known: Sequence[str], name: str) -> tuple[int, str]:
+    return (known.index(name) if name in known else len(known), name)
+
+
+def merge_kinds(root: Path) -> tuple[list[Row], list[Row]]:
+    """(rows of plans, rows of rollouts) of all runs below root, oldest first."""
+    plans: list[Row] = []
+    rollouts: list[Row] = []
+    for path in find_rows(root):
+        rows = read_rows(path)
+        (rollouts if rows and "violation_rate" in rows[0] else plans).extend(rows)
+    return plans, rollouts
