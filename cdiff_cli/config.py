@@ -18,6 +18,16 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
 
+class Loader(yaml.SafeLoader):
+    """SafeLoader with the booleans of YAML 1.2: only true and false, so that `on: clean` has the key "on"."""
+
+
+Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool" or first in "tTfF"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
 class Document:
     """A parsed YAML file that still knows the line of each value."""
 
@@ -30,8 +40,8 @@ class Document:
         except (OSError, UnicodeDecodeError) as error:
             raise SpecError(f"{path}: cannot be read as text: {error}") from None
         try:
-            self.node = yaml.compose(text, Loader=yaml.SafeLoader)
-            self.value = yaml.safe_load(text)
+            self.node = yaml.compose(text, Loader=Loader)
+            self.value = yaml.load(text, Loader=Loader)
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
             line = f":{mark.line + 1}" if mark else ""
@@ -111,7 +121,8 @@ def _explain(error: dict[str, Any]) -> str:
         return "no such field here; remove it or mend its name"
     if kind == "union_tag_invalid":
         tag, known = str(context.get("tag")), str(context.get("expected_tags"))
-        return f'no kind "{tag}"{suggestion(tag, known.replace("'", "").split(", "))}; expected one of {known}'
+        names = known.replace("'", "").split(", ")
+        return f'no kind "{tag}"{suggestion(tag, names)}; expected one of {known}'
     if kind == "union_tag_not_found":
         return "it has no kind; add `kind: linear`, `quadratic` or `dcbf`"
     if kind == "value_error":

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cdiff_cli.errors import InfeasibleError
+
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
 Pull = Callable[[Rows], Traj]
@@ -150,6 +152,8 @@ class Ellipsoid:
 
     def shift(self, margin: float) -> "Ellipsoid":
         grown = 1 + self.side * margin / float(self.m)
+        if grown <= 0 and self.side < 0:
+            raise InfeasibleError(f"no point lies {margin:g} inside an ellipsoid of semi-axis {float(self.m):g}; relax one of them")
         return replace(self, axes=self.axes * grown, m=self.m * grown)
 
     def segment_max(self, x0: Tensor, x1: Tensor) -> Tensor:

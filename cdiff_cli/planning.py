@@ -26,8 +26,7 @@ class Problem:
     """All that sampling needs, resolved.
 
     g            environment units
-    start, goal  pinned states [dim], or None
-    clip         clean estimates are clipped to [-1, 1] (trained networks)
+    start, goal  pinned states [dim], or one a plan [n, dim], or None
     """
 
     task: Task
@@ -74,22 +73,24 @@ def network_denoiser(net: torch.nn.Module) -> Denoiser:
 def check_feasible(problem: Problem) -> None:
     """Refuse a start or goal inside a wall or outside the constraints, before anything is sampled."""
     columns = [problem.task.layout.index(name) for name in problem.task.positions]
-    for name, state in (("start", problem.start), ("goal", problem.goal)):
-        if state is None:
-            continue
-        point = ", ".join(f"{c} = {v:g}" for c, v in zip(problem.task.positions, state[columns], strict=True))
-        is_free = getattr(problem.task, "is_free", None)
-        if is_free is not None and not is_free(state[columns], 0.1):
-            raise CdiffError(f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}")
-        x = torch.from_numpy(np.broadcast_to(state, (1, problem.horizon, len(state))).copy())
-        for part in problem.g.parts:
-            level = getattr(part, "level", None)
-            value = float(level(x).max()) if level is not None else 0.0
-            if value > 0:
-                raise InfeasibleError(
-                    f'the constraint "{part.name}" excludes the {name} ({point}): g = {value:.3g} there, must be <= 0; '
-                    f"move the {name} or relax the constraint"
-                )
+    for name, states in (("start", problem.start), ("goal", problem.goal)):
+        for state in () if states is None else np.atleast_2d(states):
+            _check_pin(problem, name, state, columns)
+
+
+def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) -> None:
+    point = ", ".join(f"{c} = {v:g}" for c, v in zip(problem.task.positions, state[columns], strict=True))
+    is_free = getattr(problem.task, "is_free", None)
+    if is_free is not None and not is_free(state[columns], 0.1):
+        raise CdiffError(f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}")
+    for part in problem.g.parts:
+        level = getattr(part, "level", None)
+        value = float(level(torch.from_numpy(state))) if level is not None else 0.0
+        if value > 0:
+            raise InfeasibleError(
+                f'the constraint "{part.name}" excludes the {name} ({point}): g = {value:.3g} there, must be <= 0; '
+                f"move the {name} or relax the constraint"
+            )
 
 
 def plan(

@@ -31,11 +31,10 @@ def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
     _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
     if not g.parts or z.numel() == 0:
         return z
-    if all(has_exact_form(part) for part in g.parts):
-        if len(g.parts) == 1:
-            return exact(g.parts[0], z, pins)
-        x = _dykstra(g, z, pins, tolerance)
-        if bool((_free_rows(g, x, pins) <= 100 * tolerance).all()):
+    whole = bool((pins.mask.all(1) == pins.mask.any(1)).all())  # the exact forms move all of a waypoint or nothing of it
+    if whole and all(has_exact_form(part) for part in g.parts):
+        x = exact(g.parts[0], z, pins) if len(g.parts) == 1 else _dykstra(g, z, pins, tolerance)
+        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
     return _sequential(g, z, pins, tolerance)
 
@@ -147,7 +146,10 @@ def _project_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
     h = length[..., 0] / level.axes[0] - 1  # in units of the radius: the same chain
     fixed = pins.mask[:, level.which.argmax(1)].any(1)
     target = nearest_chain(h, gamma, torch.ones_like(h[0]), fixed)
-    step = (target - h).clamp_min(-(h + 1)) * level.axes[0]
+    if not fixed[0]:  # h is nowhere below -1, its value at the centre: a bound on the first index, which the chain hands on
+        floor = -(gamma ** torch.arange(len(fixed), device=h.device).to(h.dtype))
+        target = torch.where(fixed, target, torch.maximum(target, floor))
+    step = (target - h) * level.axes[0]
     return z + (step[..., None] * unit) @ level.which
 
 

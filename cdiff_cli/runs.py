@@ -37,6 +37,7 @@ COLUMNS = {
     "mean_speed": Column("speed / m/s", 2, "mean speed the plan asks for: its length over its duration"),
     "residual": Column("residual / m", 5, "mean of |p' - p - v' dt|: positions against velocities"),
     "acceleration": Column("acceleration / m/s^2", 1, "largest |v' - v| / dt"),
+    "smooth": Column("smooth", 2, "share of plans whose largest jump is at most 1.2 times the data's 99.9 % quantile"),
     "wall": Column("in wall", 2, "share of plans with a waypoint or segment inside a wall"),
     "polish": Column("polish / m", 5, "largest displacement by the final exact projection"),
     "calls": Column("calls", 0, "network calls a plan"),
@@ -55,6 +56,7 @@ COLUMNS = {
 }
 KEYS = ("task", "constraints", "method", "preset")
 PLAN_TABLE = ("distance", "violation", "worst_waypoint", "worst_segment", "jump", "mean_speed", "calls", "plan_ms", "step_ms")
+QUALITY_TABLE = ("wall", "smooth", "jump", "residual", "acceleration", "mean_speed", "success", "goal_distance")
 ROLLOUT_TABLE = ("success", "executed_violation", "executed_worst", "violation_rate", "goal_distance", "reward", "steps")
 PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
 

@@ -24,12 +24,17 @@ SUCCESS_RADIUS = 0.45  # PointMaze's own success test
 
 @dataclass(frozen=True)
 class Maze2D:
-    """One maze. rows: the map, '#' a wall, ' ' free."""
+    """One maze.
+
+    rows     the map, '#' a wall, ' ' free
+    switch   range of the distance (m) at which a demonstration turns to its next waypoint; near ones run wide in corners
+    """
 
     name: str
     env_id: str
     horizon: int
     rows: tuple[str, ...]
+    switch: tuple[float, float] = (0.5, 0.5)
 
     layout = ("x", "y", "vx", "vy")
     units = ("m", "m", "m/s", "m/s")
@@ -175,11 +180,13 @@ class Maze2D:
         route = self.route(state()[:2], goal, lambda cell: weights.setdefault(cell, rng.uniform(1.0, 1.6)))
         points = [*(self.centre(cell) + rng.uniform(-0.15, 0.15, 2) for cell in route[1:-1]), goal]
         top_speed, corner_speed = rng.uniform(2.8, 5.0), rng.uniform(2.0, 3.4)
+        near, far = self.switch
+        turn_at = near if near == far else rng.uniform(near, far)
         drift, hold = np.zeros(2), int(rng.integers(0, 160))
         while hold >= 0:
             x = state()
             p, v = x[:2], x[2:]
-            while len(points) > 1 and np.hypot(*(points[0] - p)) < 0.5:
+            while len(points) > 1 and np.hypot(*(points[0] - p)) < turn_at:
                 points.pop(0)
             d = points[0] - p
             distance = float(np.hypot(*d))
@@ -190,13 +197,13 @@ class Maze2D:
                 after = points[1] - points[0]
                 straight = max(0.0, float(d @ after) / max(distance * np.hypot(*after), 1e-9))
                 turn = corner_speed + straight * (top_speed - corner_speed)
-                speed = min(top_speed, np.sqrt(turn**2 + 2 * 16.0 * max(distance - 0.5, 0.0)))
+                speed = min(top_speed, np.sqrt(turn**2 + 2 * 16.0 * max(distance - turn_at, 0.0)))
             drift = 0.9 * drift + rng.normal(0.0, 0.08, 2)
             wanted = d * (speed / max(distance, 1e-9))
             yield np.clip((wanted - v) * 0.6 + drift * min(1.0, distance / 0.3), -1.0, 1.0)
 
 
-UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"))
+UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"), (0.15, 0.5))
 LARGE = Maze2D(
     "maze2d-large",
     "PointMaze_Large-v3",

@@ -1,0 +1,316 @@
+"""The command line: parse, call one function, print. Heavy imports stay inside the commands, so --help is quick."""
+
+import functools
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from cdiff_cli.errors import CdiffError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
+    epilog="Start with: cdiff plan --method alm",
+)
+out, err = Console(), Console(stderr=True)
+
+RUNS = Path("runs")
+TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large or gaussian2d")]
+MethodName = Annotated[str, typer.Option("--method", help="diffuser, projected, primal-dual or alm")]
+PresetName = Annotated[str, typer.Option("--preset", help="recommended (ours), paper (as printed), released (the authors' code)")]
+ConstraintFile = Annotated[Path | None, typer.Option("--constraints", help="YAML file of constraints [default: the task's own]")]
+CheckpointFile = Annotated[Path | None, typer.Option("--checkpoint", help="a .safetensors checkpoint [default: the shipped one]")]
+Start = Annotated[str | None, typer.Option("--start", help="start position, metres, as 0.3,-1.2 [default: the paper's]")]
+Goal = Annotated[str | None, typer.Option("--goal", help="goal position, metres, as 0.1,0.9 [default: the paper's]")]
+Kernel = Annotated[str | None, typer.Option("--kernel", help="ddpm, ddim or langevin [default: the preset's]")]
+Steps = Annotated[int | None, typer.Option("--steps", help="diffusion steps, at most as trained; few go best with --kernel ddim")]
+Settings = Annotated[list[str] | None, typer.Option("--set", help="a method's constant, as rho=0.05; may be repeated")]
+Count = Annotated[int, typer.Option("--n", "--episodes", help="number of plans, one seed each")]
+Seed = Annotated[int, typer.Option("--seed", help="first seed; plans use seed, seed + 1, ...")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda")]
+Random = Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each plan")]
+AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object instead of the table")]
+RunsFolder = Annotated[Path, typer.Option("--runs", help="where runs are kept")]
+
+
+def reported(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Errors of the user as one line on stderr and exit code 2; Ctrl-C as exit code 130."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return command(*args, **kwargs)
+        except CdiffError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(130) from None
+
+    return run
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr: call it with (what, done, of how many)."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    tasks: dict[str, Any] = {}
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+
+        def tick(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total)
+            bar.update(tasks[what], completed=done)
+
+        yield tick
+
+
+@app.command()
+@reported
+def train(
+    task: TaskName = "maze2d-umaze",
+    recipe: Annotated[str, typer.Option(help="small (minutes on two cores) or paper (the paper's size)")] = "small",
+    seed: Annotated[int, typer.Option(help="seed of the weights, the noise and the order of the data")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the last saved state of this training")] = False,
+    dataset: Annotated[str | None, typer.Option(help="a local Minari dataset id or a D4RL-style .hdf5 [default: generate]")] = None,
+    device: Device = "auto",
+    runs: RunsFolder = RUNS,
+) -> None:
+    """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors and its card."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from cdiff_cli import training
+    from cdiff_cli.recipe import load_recipe, shown
+    from cdiff_cli.tasks import load_task
+
+    problem = load_task(task)
+    plan = load_recipe(task)
+    work = runs / f"train-{task}-{recipe}-{seed}"
+    shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
+    columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
+    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
+        data, fit = None, None
+
+        def on_data(done: int, total: int) -> None:
+            nonlocal data
+            data = bar.add_task("demonstrations", total=total, loss="", rate="") if data is None else data
+            bar.update(data, completed=done)
+
+        def on_step(status: training.Status) -> None:
+            nonlocal fit
+            if fit is None:
+                fit = bar.add_task("training", total=status.steps, completed=status.step - 1, loss="", rate="")
+            speed = bar.tasks[-1].speed
+            rate = f"{speed:.1f} steps/s" if speed else ""
+            bar.update(fit, completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
+
+        try:
+            checkpoint = training.train(
+                problem,
+                plan,
+                recipe,
+                seed=seed,
+                device=training.choose_device(device),
+                work=work,
+                resume=resume,
+                dataset=dataset,
+                on_data=on_data,
+                on_step=on_step,
+            )
+        except KeyboardInterrupt:
+            typer.echo(f"interrupted; {work}/state.safetensors is kept: go on with --resume", err=True)
+            raise typer.Exit(130) from None
+    card = checkpoint.card
+    target = training.install(checkpoint)
+    out.print(f"{card.steps} steps in {card.wall_s / 60:.1f} min on {card.device}: mean squared error {card.mse:.5f}")
+    out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {recipe}.previous.safetensors)", highlight=False)
+
+
+def options(values: dict[str, Any]) -> Any:
+    """The Options of plan and rollout from a command's local variables."""
+    from dataclasses import fields
+
+    from cdiff_cli.request import Options
+
+    values = values | {"settings": tuple(values["settings"] or ())}
+    return Options(**{f.name: values[f.name] for f in fields(Options) if f.name in values})
+
+
+def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
+    """Print a run: its table on stdout, where it lies, its picture."""
+    from cdiff_cli.runs import compare
+    from cdiff_cli.tables import render
+
+    groups = compare([{k: float(v) if isinstance(v, int) and k != "seed" else v for k, v in row.items()} for row in finished.rows])
+    if as_json:
+        typer.echo(json.dumps({"run": str(finished.path), "summary": json.loads(render(groups, table, "json"))}))
+        return
+    transposed(groups[0], table)
+    for note in finished.notes:
+        out.print(note, highlight=False)
+    out.print(f"run      {finished.path}", highlight=False, soft_wrap=True)
+    out.print(f"picture  {finished.picture}", highlight=False, soft_wrap=True)
+
+
+def transposed(group: Any, names: tuple[str, ...]) -> None:
+    """One group as a table with a line a metric: mean, standard error, meaning."""
+    from rich.table import Table
+
+    from cdiff_cli.runs import COLUMNS
+
+    table = Table(title=" · ".join(group.key) + f" · n = {group.n}", title_justify="left")
+    table.add_column("metric")
+    table.add_column("mean ± standard error", justify="right")
+    table.add_column("meaning", style="dim")
+    for name in names:
+        if name in group.cells:
+            table.add_row(COLUMNS[name].title, group.cells[name].text(COLUMNS[name].digits), COLUMNS[name].meaning)
+    out.print(table)
+
+
+def warn_of_speed(resolved: Any) -> None:
+    from cdiff_cli.request import needed_speed
+
+    speed = needed_speed(resolved)
+    if speed and speed[0] > speed[1]:
+        typer.echo(
+            f"warning: the shortest way asks for {speed[0]:.2f} m/s over the horizon, 95 % of the data's windows stay below "
+            f"{speed[1]:.2f} m/s: expect jumps; choose a closer goal",
+            err=True,
+        )
+
+
+@app.command()
+@reported
+def plan(
+    task: TaskName = "maze2d-umaze",
+    method: MethodName = "alm",
+    preset: PresetName = "recommended",
+    constraints: ConstraintFile = None,
+    checkpoint: CheckpointFile = None,
+    start: Start = None,
+    goal: Goal = None,
+    random: Random = False,
+    kernel: Kernel = None,
+    steps: Steps = None,
+    settings: Settings = None,
+    n: Count = 10,
+    seed: Seed = 0,
+    device: Device = "auto",
+    runs: RunsFolder = RUNS,
+    as_json: AsJson = False,
+) -> None:
+    """Plan trajectories that obey the constraints; writes a run directory and prints its table."""
+    given = locals()
+    from cdiff_cli.experiment import plan_run
+    from cdiff_cli.request import resolve
+    from cdiff_cli.runs import PLAN_TABLE
+
+    resolved = resolve(options(given))
+    warn_of_speed(resolved)
+    with progress() as tick:
+        finished = plan_run(resolved, runs, tick)
+    finish(finished, PLAN_TABLE, as_json)
+
+
+@app.command()
+@reported
+def rollout(
+    task: TaskName = "maze2d-umaze",
+    method: MethodName = "alm",
+    preset: PresetName = "recommended",
+    constraints: ConstraintFile = None,
+    checkpoint: CheckpointFile = None,
+    start: Start = None,
+    goal: Goal = None,
+    random: Random = False,
+    kernel: Kernel = None,
+    steps: Steps = None,
+    settings: Settings = None,
+    n: Count = 10,
+    seed: Seed = 0,
+    device: Device = "auto",
+    video: Annotated[str | None, typer.Option(help="gif or mp4 of the first episode")] = None,
+    runs: RunsFolder = RUNS,
+    as_json: AsJson = False,
+) -> None:
+    """Plan, then follow the plans in the simulator; scores the executed path against the constraints."""
+    given = locals()
+    if video not in (None, "gif", "mp4"):
+        raise CdiffError(f"--video: expected gif or mp4, found {video}")
+    from cdiff_cli.experiment import rollout_run
+    from cdiff_cli.request import resolve
+    from cdiff_cli.runs import QUALITY_TABLE, ROLLOUT_TABLE
+
+    resolved = resolve(options(given))
+    warn_of_speed(resolved)
+    with progress() as tick:
+        finished = rollout_run(resolved, runs, tick, video)
+    finish(finished, tuple(dict.fromkeys((*ROLLOUT_TABLE, *QUALITY_TABLE))), as_json)
+
+
+@app.command()
+@reported
+def compare(
+    folder: Annotated[Path, typer.Argument(help="a folder of runs")] = RUNS,
+    style: Annotated[str, typer.Option("--format", help="rich, markdown, latex, csv or json")] = "rich",
+    paper: Annotated[bool, typer.Option("--paper", help="the paper's definitions and units, its values beside ours")] = False,
+    task: Annotated[str | None, typer.Option(help="only this task")] = None,
+) -> None:
+    """Compare the runs of a folder: mean ± standard error by task, constraints, method and preset; newest row a seed."""
+    from cdiff_cli import runs, tables
+    from cdiff_cli.errors import suggestion
+    from cdiff_cli.recipe import home
+
+    if style not in tables.FORMATS:
+        raise CdiffError(f'no format "{style}"{suggestion(style, tables.FORMATS)}; choose from {", ".join(tables.FORMATS)}')
+    if not folder.is_dir():
+        raise CdiffError(f"{folder}: no such folder; make a run first: cdiff plan --method alm")
+    plans, rollouts = (([r for r in rows if task in (None, r["task"])]) for rows in runs.merge_kinds(folder))
+    if not plans and not rollouts:
+        raise CdiffError(f"{folder}: no runs{f' of {task}' if task else ''} here; make one first: cdiff plan --method alm")
+    values = tables.read_paper(home() / "runs" / "reference" / "paper.csv") if paper else None
+    plan_table = runs.PAPER_TABLE if paper else runs.PLAN_TABLE
+    wanted = [("plans", plans, plan_table), ("rollouts", rollouts, (*runs.ROLLOUT_TABLE, "wall", "smooth"))]
+    shown = [(title, runs.compare(rows), table) for title, rows, table in wanted if rows]
+    if style == "json":
+        found = {title: json.loads(tables.render(groups, table, style, values)) for title, groups, table in shown}
+        typer.echo(json.dumps(found, indent=2))
+        return
+    for title, groups, table in shown:
+        text = tables.render(groups, table, style, values if title == "plans" else None, title)
+        if style == "rich":
+            out.print(text)
+        else:
+            typer.echo(text)
+    if style == "rich":
+        out.print("mean ± standard error over n seeds, the newest row of each; a preset with * was changed by an option", style="dim")
+
+
+@app.command()
+@reported
+def check(
+    file: Annotated[Path | None, typer.Argument(help="a constraint file")] = None,
+    schema: Annotated[bool, typer.Option("--schema", help="print the JSON schema of constraint files, for editors")] = False,
+    picture: Annotated[Path | None, typer.Option(help="where to draw the constraints [default: runs/check-NAME.png]")] = None,
+) -> None:
+    """Validate a constraint file, say what it means, and draw it over the demonstrations."""
+    from cdiff_cli import spec
+
+    if schema:
+        typer.echo(json.dumps(spec.json_schema(), indent=2))
+        return
+    if file is None:
+        raise CdiffError("name a constraint file, as in `cdiff check constraints/maze2d-umaze.yaml`, or ask for --schema")
+    from cdiff_cli.explain import explain
+
+    explain(file, picture or RUNS / f"check-{file.stem}.png", out)

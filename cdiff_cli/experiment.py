@@ -1,0 +1,169 @@
+"""A whole command: plan or roll out, measure, and leave a run directory behind."""
+
+import json
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdiff_cli import figures, metrics
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.methods import Unconstrained
+from cdiff_cli.planning import Plans, Rollout, follow, plan
+from cdiff_cli.request import Resolved
+from cdiff_cli.runs import Row, new_run, write_rows, write_yaml
+from cdiff_cli.training import device_name, git_commit
+
+Array = NDArray[np.float64]
+Tick = Callable[[str, int, int], None]
+"""(what, done, of how many)"""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run that is on disk, and what the command prints of it."""
+
+    path: Path
+    rows: list[Row]
+    picture: Path
+    notes: tuple[str, ...] = ()
+
+
+def plan_run(resolved: Resolved, root: Path, tick: Tick) -> Finished:
+    """Plan, measure, write runs/<stamp>-plan-.../"""
+    plans, free = _plan_both(resolved, tick)
+    rows = _plan_rows(resolved, plans, free)
+    notes = []
+    with new_run(root, _name("plan", resolved)) as run:
+        _write_plans(run.path, resolved, plans, free, rows)
+        _plan_pictures(run.path, resolved, plans, free)
+        if plans.chain is not None and resolved.problem.horizon == 1:
+            notes.append(_chain_figure(run.path, resolved, plans))
+    return Finished(run.path, rows, run.path / "plan.png", tuple(notes))
+
+
+def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None, hold: int = 100) -> Finished:
+    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../"""
+    task = resolved.problem.task
+    if not hasattr(task, "track"):
+        raise CdiffError(f"{task.name} has no environment to roll out in; plan it with `cdiff plan --task {task.name}`")
+    plans, free = _plan_both(resolved, tick)
+    n = len(plans.x)
+    done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n))
+    measured = metrics.rollout_metrics(resolved.problem.g, done.x, done.reward, done.success, done.goal_distance)
+    rows = [row | more for row, more in zip(_plan_rows(resolved, plans, free), measured, strict=True)]
+    with new_run(root, _name("rollout", resolved)) as run:
+        _write_plans(run.path, resolved, plans, free, rows)
+        _write_rollout(run.path, resolved, done)
+        _plan_pictures(run.path, resolved, plans, free)
+        title = f"{task.name}, {resolved.options.method}: executed over planned"
+        figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
+        if video:
+            tick("video", 0, 1)
+            figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
+            tick("video", 1, 1)
+    return Finished(run.path, rows, run.path / "rollout.png")
+
+
+def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
+    """The asked plans, and the unconstrained ones of the same noise."""
+    calls = resolved.problem.schedule.n_steps
+    free = plan(
+        resolved.problem,
+        Unconstrained(),
+        resolved.seeds,
+        kernel=resolved.kernel,
+        on_step=lambda call: tick("diffuser", call, calls),
+    )
+    if isinstance(resolved.method, Unconstrained):
+        return free, free
+    total = calls + resolved.preset.extra_steps
+    plans = plan(
+        resolved.problem,
+        resolved.method,
+        resolved.seeds,
+        kernel=resolved.kernel,
+        extra_steps=resolved.preset.extra_steps,
+        polish=resolved.preset.polish,
+        on_step=lambda call: tick(resolved.options.method, call, total),
+    )
+    return plans, free
+
+
+def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
+    task, n = resolved.problem.task, len(plans.x)
+    units = resolved.recipe.paper_units
+    measured = metrics.plan_metrics(task, resolved.problem.g, plans.x, free.x, units)
+    cost = {
+        "calls": plans.calls,
+        "plan_ms": 1e3 * plans.total_s / n,
+        "step_ms": 1e3 * plans.total_s / plans.calls,
+        "overhead": 100 * (plans.total_s - plans.network_s) / max(plans.network_s, 1e-9),
+    }
+    rows = []
+    for i, (seed, values) in enumerate(zip(resolved.seeds, measured, strict=True)):
+        row: Row = resolved.row() | {"seed": seed} | values | {"polish": float(plans.polish[i])} | cost
+        if resolved.checkpoint is not None:
+            row["smooth"] = float(values["jump"] <= 1.2 * resolved.checkpoint.card.data["jump_q999"])
+        rows.append(row)
+    return rows
+
+
+def _write_plans(path: Path, resolved: Resolved, plans: Plans, free: Plans, rows: list[Row]) -> None:
+    write_yaml(
+        path / "run.yaml",
+        {
+            "command": ["cdiff", *sys.argv[1:]],
+            "commit": git_commit(),
+            "versions": {name: version(name) for name in ("torch", "numpy", "mujoco", "gymnasium", "gymnasium-robotics")},
+            "python": platform.python_version(),
+            "device": device_name(resolved.problem.device),
+            "wall_s": round(plans.total_s, 3),
+        }
+        | resolved.config(),
+    )
+    layout = np.array(resolved.problem.task.layout)
+    np.savez_compressed(path / "plan.npz", x=plans.x, x_free=free.x, layout=layout, seed=np.array(resolved.seeds))
+    trace = {"violation": plans.trace, "violation_free": free.trace}
+    np.savez_compressed(path / "trace.npz", **trace, axes=np.array(["call", "x_t or clean estimate", "plan"]))
+    write_rows(path / "rows.csv", rows)
+    proof = metrics.certificate(resolved.problem.g, plans.x, resolved.seeds)
+    (path / "certificate.json").write_text(json.dumps(proof, indent=1))
+
+
+def _write_rollout(path: Path, resolved: Resolved, done: Rollout) -> None:
+    layout = np.array(resolved.problem.task.layout)
+    arrays = asdict(done)
+    np.savez_compressed(path / "rollout.npz", **arrays, layout=layout, seed=np.array(resolved.seeds))
+
+
+def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) -> None:
+    task, options = resolved.problem.task, resolved.options
+    title = f"{task.name}, {options.method} ({options.preset}), n = {len(plans.x)}"
+    x_free = None if isinstance(resolved.method, Unconstrained) else free.x
+    figures.plan_picture(path / "plan.png", task, resolved.problem.g, plans.x, x_free, title)
+    traces = {"diffuser": free.trace} | ({} if x_free is None else {options.method: plans.trace})
+    figures.convergence_picture(path / "convergence.png", traces)
+
+
+def _chain_figure(path: Path, resolved: Resolved, plans: Plans) -> str:
+    """Figure 1 and its number: the share of samples that sit on the boundary, beside the true constrained law's."""
+    task, g, within = resolved.problem.task, resolved.problem.g, 0.05
+    assert plans.chain is not None
+    truth = task.truth(200_000, 0)[:, None]
+    allowed = truth[metrics.worst_waypoint(g, truth) <= 0]
+    title = f"{resolved.options.method}, {resolved.kernel}: chains (red), last points (blue)"
+    figures.chain_picture(path / "chain.png", task, g, plans.chain, allowed[:, 0], title)
+    ours, true = (metrics.boundary_mass(g, x, within) for x in (plans.x, allowed))
+    return f"share of samples with -g <= {within} (on the boundary): {ours:.3f}; of the true constrained law: {true:.3f}"
+
+
+def _name(command: str, resolved: Resolved) -> str:
+    options = resolved.options
+    return f"{command}-{options.task}-{options.method}-{options.preset}"

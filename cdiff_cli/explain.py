@@ -1,0 +1,50 @@
+"""`cdiff check`: what a constraint file means, as a table and a picture."""
+
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from cdiff_cli import figures
+from cdiff_cli.config import Document
+from cdiff_cli.projection import has_exact_form
+from cdiff_cli.recipe import home, load_recipe
+from cdiff_cli.spec import load_constraints
+from cdiff_cli.tasks import load_task
+from cdiff_cli.training import load_checkpoint
+
+
+def explain(file: Path, picture: Path, out: Console) -> None:
+    """Print the constraints of a file: rows, coordinates, units, projection, share of demonstrations that satisfy them; draw
+    them over those demonstrations.
+    """
+    document = Document(file)
+    name = document.value.get("task") if isinstance(document.value, dict) else None
+    if not isinstance(name, str):
+        raise document.error((), "the file must begin with `task: NAME` and a list `constraints:`")
+    task, recipe = load_task(name), load_recipe(name)
+    kinds, g = load_constraints(file, name, task.layout)
+    shipped = home() / "models" / name / "small.safetensors"
+    demonstrations = load_checkpoint(shipped, name).demonstrations.double() if shipped.exists() else None
+    unit = dict(zip(task.layout, task.units, strict=True))
+    table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
+    for heading in ("name", "kind", "meaning", "rows", "coordinates", "projection", "demonstrations that obey"):
+        table.add_column(heading, overflow="fold")
+    for spec, part in zip(kinds, g.parts, strict=True):
+        used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
+        obey = "" if demonstrations is None else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+        table.add_row(
+            spec.name,
+            spec.kind,
+            spec.describe(),
+            str(len(part.labels(recipe.horizon))),
+            ", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used),
+            "exact" if has_exact_form(part) else "sequential (ProxQP)",
+            obey,
+        )
+    out.print(table)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
+    figures.constraint_picture(picture, task, g, sample, file.stem)
+    out.print(f"picture  {picture}", highlight=False, soft_wrap=True)

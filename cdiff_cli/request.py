@@ -1,0 +1,211 @@
+"""From the options of a command to a resolved problem: recipe, preset, method, constraints, checkpoint, pins."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cdiff_cli.constraint import Constraint
+from cdiff_cli.data import Normaliser
+from cdiff_cli.diffusion import KERNELS, Method, Schedule
+from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.methods import METHODS, make_method
+from cdiff_cli.planning import Problem, check_feasible, network_denoiser
+from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
+from cdiff_cli.spec import Kind, load_constraints
+from cdiff_cli.tasks import load_task
+from cdiff_cli.training import Checkpoint, choose_device, load_checkpoint
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked for; None is the task's own default."""
+
+    task: str = "maze2d-umaze"
+    method: str = "alm"
+    preset: str = "recommended"
+    constraints: Path | None = None
+    checkpoint: Path | None = None
+    recipe: str = "small"
+    start: str | None = None
+    goal: str | None = None
+    kernel: str | None = None
+    steps: int | None = None
+    settings: tuple[str, ...] = ()
+    n: int = 10
+    seed: int = 0
+    device: str = "auto"
+    random: bool = False
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """Everything a command needs, checked."""
+
+    options: Options
+    recipe: Recipe
+    preset: Preset
+    kernel: str
+    method: Method
+    settings: dict[str, Any]
+    problem: Problem
+    kinds: Sequence[Kind]
+    constraints_path: Path
+    checkpoint: Checkpoint | None
+
+    @property
+    def seeds(self) -> list[int]:
+        return list(range(self.options.seed, self.options.seed + self.options.n))
+
+    def row(self) -> dict[str, Any]:
+        """The columns that say what was run."""
+        return {
+            "task": self.options.task,
+            "constraints": self.constraints_path.stem,
+            "method": self.options.method,
+            "preset": self.options.preset + ("*" if self.options.settings or self.options.kernel or self.options.steps else ""),
+            "on": self.settings.get("on", ""),
+            "kernel": self.kernel,
+        }
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, for run.yaml."""
+        options = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.options).items()}
+        card = self.checkpoint.card if self.checkpoint else None
+        pins = {name: None if s is None else s.tolist() for name, s in self._pins().items()}
+        return {
+            "options": options | {"settings": list(self.options.settings)},
+            "method": {self.options.method: self.settings},
+            "kernel": self.kernel,
+            "extra_steps": self.preset.extra_steps,
+            "polish": self.preset.polish,
+            "n_steps": self.problem.schedule.n_steps,
+            "horizon": self.problem.horizon,
+            **pins,
+            "constraints": {
+                "file": str(shown(self.constraints_path)),
+                "sha256": hashlib.sha256(self.constraints_path.read_bytes()).hexdigest(),
+                "content": [spec.model_dump(mode="json", exclude_none=True) for spec in self.kinds],  # type: ignore[attr-defined]
+            },
+            "checkpoint": None if card is None else card.model_dump(mode="json"),
+        }
+
+    def _pins(self) -> dict[str, Array | None]:
+        return {"start": self.problem.start, "goal": self.problem.goal}
+
+
+def resolve(options: Options) -> Resolved:
+    """Read and check all that the options name; raises a CdiffError before anything is computed or written."""
+    task = load_task(options.task)
+    if options.n < 1:
+        raise CdiffError(f"--n: expected at least 1 plan, found {options.n}")
+    if options.method not in METHODS:
+        make_method(options.method, {})
+    recipe = load_recipe(options.task)
+    if options.preset not in recipe.presets:
+        known = ", ".join(recipe.presets)
+        raise CdiffError(f'no preset "{options.preset}"{suggestion(options.preset, recipe.presets)}; {task.name} has {known}')
+    preset = recipe.presets[options.preset]
+    settings = {**preset.methods.get(options.method, {}), **parse_settings(options.settings)}
+    method = make_method(options.method, settings)
+    settings = asdict(method)  # type: ignore[call-overload]
+    kernel = options.kernel or preset.kernel
+    if kernel not in KERNELS:
+        raise CdiffError(f'no kernel "{kernel}"{suggestion(kernel, KERNELS)}; choose from {", ".join(KERNELS)}')
+    path = options.constraints or shown(home() / "constraints" / recipe.constraints)
+    kinds, g = load_constraints(path, task.name, task.layout)
+    device = choose_device(options.device)
+    schedule = Schedule.cosine(recipe.n_steps)
+    if hasattr(task, "denoiser"):
+        checkpoint, denoiser, normaliser = None, task.denoiser(schedule), Normaliser.identity(len(task.layout))
+        normaliser = Normaliser(normaliser.centre, normaliser.scale * task.scale)
+    else:
+        where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")
+        checkpoint = load_checkpoint(where, task.name, device)
+        denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
+        if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
+            schedule = Schedule.cosine(checkpoint.card.n_steps)
+    if options.steps is not None:
+        if not 1 <= options.steps <= schedule.n_steps:
+            raise CdiffError(f"--steps: expected 1 to {schedule.n_steps} (as trained), found {options.steps}")
+        schedule = schedule.respaced(options.steps)
+    start = parse_state("--start", options.start, recipe.start, task)
+    goal = parse_state("--goal", options.goal, recipe.goal, task)
+    horizon = checkpoint.card.horizon if checkpoint else recipe.horizon
+    if options.random:
+        if checkpoint is None or not hasattr(task, "random_point"):
+            raise CdiffError(f"--random: {task.name} has no start and goal to draw")
+        start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, start, goal, device)
+    check_feasible(problem)
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
+
+
+def needed_speed(resolved: Resolved) -> tuple[float, float] | None:
+    """(mean speed the shortest way asks for, 95 % of the data's windows stay below), m/s; None where it has no meaning."""
+    problem, task = resolved.problem, resolved.problem.task
+    if problem.start is None or problem.goal is None or resolved.checkpoint is None or resolved.options.random:
+        return None
+    columns = [task.layout.index(name) for name in task.positions]
+    length = task.path_length(problem.start[columns], problem.goal[columns])
+    return length / ((problem.horizon - 1) * task.dt), resolved.checkpoint.card.data["speed_q95"]
+
+
+def parse_settings(settings: Sequence[str]) -> dict[str, str]:
+    """["rho=0.05"] -> {"rho": "0.05"}."""
+    pairs = {}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals or not key or not value:
+            raise CdiffError(f"--set: expected name=value such as rho=0.05, found {text!r}")
+        pairs[key.strip()] = value.strip()
+    return pairs
+
+
+def parse_state(flag: str, text: str | None, default: dict[str, float] | None, task: Any) -> Array | None:
+    """'0.3,-1.2' (the positions, at rest) or 'x=0.3,y=-1.2,vx=1' as a state [dim]; coordinates left out are 0."""
+    if text is None and default is None:
+        return None
+    values = dict(default or {}) if text is None else {}
+    for i, piece in enumerate((text or "").split(",") if text is not None else []):
+        name, equals, number = piece.rpartition("=")
+        name = name.strip() if equals else task.positions[i] if i < len(task.positions) else ""
+        if name not in task.layout:
+            raise CdiffError(f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} as 0.3,-1.2 or x=0.3,y=-1.2')
+        try:
+            values[name] = float(number)
+        except ValueError:
+            raise CdiffError(f"{flag}: expected a number for {name}, found {number!r}") from None
+    missing = [name for name in task.positions if name not in values]
+    if missing:
+        raise CdiffError(f"{flag}: {', '.join(missing)} missing; give {','.join(task.positions)}, as {flag} 0.3,-1.2")
+    state = np.array([values.get(name, 0.0) for name in task.layout])
+    if not np.isfinite(state).all():
+        raise CdiffError(f"{flag}: expected finite numbers, found {text}")
+    return state
+
+
+def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
+    """n random feasible starts and goals [n, dim], at rest: both allowed by the constraints, and the shortest way between
+    them no faster over one horizon than 95 % of the data's windows.
+    """
+    rng, starts, goals = np.random.default_rng(seed), [], []
+    still = np.zeros(len(task.layout) - len(task.positions))
+    for _ in range(100_000):
+        pair = np.stack([np.concatenate((task.random_point(rng), still)) for _ in range(2)])
+        speed = task.path_length(*pair[:, :2]) / ((card.horizon - 1) * task.dt)
+        x = torch.from_numpy(pair)
+        levels = [level for part in g.parts if (level := getattr(part, "level", None)) is not None]
+        if speed <= card.data["speed_q95"] and all(bool((level(x) <= 0).all()) for level in levels):
+            starts.append(pair[0])
+            goals.append(pair[1])
+            if len(starts) == n:
+                return np.stack(starts), np.stack(goals)
+    raise CdiffError("no feasible pair of start and goal in 100000 draws: the constraints leave too little of the maze")
