@@ -156,13 +156,14 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
         return
     transposed(groups[0], table)
     for note in finished.notes:
-        out.print(note, highlight=False)
-    out.print(f"run      {finished.path}", highlight=False, soft_wrap=True)
-    out.print(f"picture  {finished.picture}", highlight=False, soft_wrap=True)
+        typer.echo(note)
+    typer.echo(f"run      {finished.path}")
+    typer.echo(f"picture  {finished.picture}")
 
 
 def transposed(group: Any, names: tuple[str, ...]) -> None:
     """One group as a table with a line a metric: mean, standard error, meaning."""
+    from rich.markup import escape
     from rich.table import Table
 
     from cdiff_cli.runs import COLUMNS
@@ -173,7 +174,7 @@ def transposed(group: Any, names: tuple[str, ...]) -> None:
     table.add_column("meaning", style="dim")
     for name in names:
         if name in group.cells:
-            table.add_row(COLUMNS[name].title, group.cells[name].text(COLUMNS[name].digits), COLUMNS[name].meaning)
+            table.add_row(COLUMNS[name].title, group.cells[name].text(COLUMNS[name].digits), escape(COLUMNS[name].meaning))
     out.print(table)
 
 
@@ -293,7 +294,9 @@ def compare(
         else:
             typer.echo(text)
     if style == "rich":
-        out.print("mean ± standard error over n seeds, the newest row of each; a preset with * was changed by an option", style="dim")
+        out.print(
+            "mean ± standard error over n seeds, the newest row of each; a preset with * was changed by an option", style="dim"
+        )
 
 
 @app.command()

@@ -40,16 +40,19 @@ class Document:
         except (OSError, UnicodeDecodeError) as error:
             raise SpecError(f"{path}: cannot be read as text: {error}") from None
         try:
-            self.node = yaml.compose(text, Loader=Loader)
+            node = yaml.compose(text, Loader=Loader)
             self.value = yaml.load(text, Loader=Loader)
+            self._refuse_duplicates(self.node)
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
             line = f":{mark.line + 1}" if mark else ""
             problem = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise SpecError(f"{path}{line}: not valid YAML: {problem}") from None
-        if self.node is None:
+        except (ValueError, RecursionError) as error:  # an impossible date, an alias that contains itself
+            raise SpecError(f"{path}: not valid YAML: {error}") from None
+        if node is None:
             raise SpecError(f"{path}: the file is empty")
-        self._refuse_duplicates(self.node)
+        self.node: yaml.Node = node
 
     def line(self, location: Sequence[str | int]) -> int:
         """Line of the value at that location, or of the closest thing around it that exists."""
@@ -80,7 +83,7 @@ class Document:
             first = error.errors()[0]
             raise self.error(first["loc"], _explain(dict(first))) from None
 
-    def _refuse_duplicates(self, node: yaml.Node) -> None:
+    def _refuse_duplicates(self, node: yaml.Node | None) -> None:
         if isinstance(node, yaml.MappingNode):
             seen: set[str] = set()
             for key, value in node.value:

@@ -323,7 +323,7 @@ class Constraint:
         each = [part.linearise(x) for part in self.parts]
         if not each:
             empty = x.new_zeros(len(x), 0)
-            return empty, lambda w: torch.zeros_like(x), empty
+            return empty, lambda _: torch.zeros_like(x), empty
         sizes = [len(rows[0]) for rows, _, _ in each] if len(x) else [rows.shape[1] for rows, _, _ in each]
 
         def pull(w: Rows) -> Traj:

@@ -202,11 +202,13 @@ def _hdf5_episodes(path: Path, task: Task) -> Iterator[Array]:
     try:
         with h5py.File(path, "r") as file:
             states = np.asarray(file["observations"], dtype=np.float64)
+            if len(states) == 0:
+                raise ValueError("observations is empty")
             ends = np.zeros(len(states), dtype=bool)
             for key in ("timeouts", "terminals"):
                 if key in file:
                     ends |= np.asarray(file[key], dtype=bool)
-    except (OSError, KeyError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs observations and timeouts") from None
     for episode in np.split(states, np.flatnonzero(ends) + 1):
         if len(episode):

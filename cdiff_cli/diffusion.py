@@ -57,7 +57,7 @@ def ddpm(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:
     return mean + math.sqrt(beta * (1 - b) / (1 - a)) * z
 
 
-def ddim(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:
+def ddim(x: Traj, x0: Traj, z: Traj, a: float, b: float) -> Traj:  # noqa: ARG001
     """Deterministic step (Song et al., 2021, Eq. 12 with sigma = 0)."""
     noise = (x - math.sqrt(a) * x0) / math.sqrt(1 - a)
     return math.sqrt(b) * x0 + math.sqrt(1 - b) * noise

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,8 +139,8 @@ def _write_plans(path: Path, resolved: Resolved, plans: Plans, free: Plans, rows
 
 def _write_rollout(path: Path, resolved: Resolved, done: Rollout) -> None:
     layout = np.array(resolved.problem.task.layout)
-    arrays = asdict(done)
-    np.savez_compressed(path / "rollout.npz", **arrays, layout=layout, seed=np.array(resolved.seeds))
+    arrays: Any = asdict(done) | {"layout": layout, "seed": np.array(resolved.seeds)}
+    np.savez_compressed(path / "rollout.npz", **arrays)
 
 
 def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) -> None:
@@ -154,7 +154,7 @@ def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) ->
 
 def _chain_figure(path: Path, resolved: Resolved, plans: Plans) -> str:
     """Figure 1 and its number: the share of samples that sit on the boundary, beside the true constrained law's."""
-    task, g, within = resolved.problem.task, resolved.problem.g, 0.05
+    task, g, within = cast(Any, resolved.problem.task), resolved.problem.g, 0.05
     assert plans.chain is not None
     truth = task.truth(200_000, 0)[:, None]
     allowed = truth[metrics.worst_waypoint(g, truth) <= 0]

@@ -108,7 +108,7 @@ def _frames(task: Any, g: Constraint, executed: Array, plan: Array, every: int) 
         trail.set_data(*executed[: tau + 1, at].T)
         ball.set_data(*executed[tau : tau + 1, at].T)
         figure.canvas.draw()
-        frame = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+        frame = np.asarray(figure.canvas.buffer_rgba())[..., :3]
         yield frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2].copy()
     plt.close(figure)
 

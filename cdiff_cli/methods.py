@@ -29,10 +29,10 @@ Coefficient = Literal["beta/2", "one"]
 class Unconstrained:
     """Diffuser: x_{t-1} = reverse(x0), constraints ignored."""
 
-    def init(self, x: Traj, g: Constraint) -> None:  # noqa: ARG002
+    def init(self, x: Traj, g: Constraint) -> None:
         return None
 
-    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:  # noqa: ARG002
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
         return step.reverse(step.x0), state
 
 
@@ -42,7 +42,7 @@ class Projected:
 
     on: On = "clean"
 
-    def init(self, x: Traj, g: Constraint) -> None:  # noqa: ARG002
+    def init(self, x: Traj, g: Constraint) -> None:
         return None
 
     def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
@@ -221,4 +221,3 @@ def _typed(where: str, value: Any, hint: Any) -> Any:
     if not 0 < number < float("inf") or (hint is int and number != int(number)):
         raise CdiffError(f"{where}: expected a positive {'whole ' if hint is int else ''}number, found {value}")
     return hint(number)
-

@@ -61,8 +61,10 @@ def acceleration(x: Array, velocities: Sequence[int], dt: float) -> Array:
 
 def hits_wall(x: Array, columns: Sequence[int], boxes: Array) -> NDArray[np.bool_]:
     """Whether a waypoint or a segment between waypoints enters a box (x_min, y_min, x_max, y_max) [n]."""
-    if len(boxes) == 0 or x.shape[1] < 2:
+    if len(boxes) == 0:
         return np.zeros(len(x), dtype=bool)
+    if x.shape[1] == 1:
+        x = x.repeat(2, axis=1)  # a segment of no length: the waypoint itself
     hit = np.zeros(len(x), dtype=bool)
     p = x[:, :-1][..., columns]
     d = x[:, 1:][..., columns] - p
@@ -100,11 +102,15 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
     return [{name: float(values[i]) for name, values in columns.items()} for i in range(len(x))]
 
 
-def rollout_metrics(g: Constraint, x: Array, reward: Array, success: Array, goal_distance: Array) -> list[dict[str, float]]:
+def rollout_metrics(
+    g: Constraint, x: Array, reward: Array, success: NDArray[np.bool_], goal_distance: Array
+) -> list[dict[str, float]]:
     """The metrics of each executed episode; states after its end are NaN."""
     rows = _rows(g, x)
     steps = np.isfinite(x).all(-1).sum(1) - 1
-    unsafe = np.stack([_unsafe_states(part, x) for part in g.parts]).any(0) if g.parts else np.zeros(x.shape[:2], dtype=bool)
+    unsafe = np.zeros(x.shape[:2], dtype=bool)
+    for part in g.parts:
+        unsafe |= _unsafe_states(part, x)
     return [
         {
             "reward": float(np.nansum(reward[i])),

@@ -1,6 +1,8 @@
 """The networks: nn.Modules and nothing else."""
 
 import math
+from itertools import pairwise
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +35,7 @@ class TemporalUnet(nn.Module):
         nn.Module.__init__(self)
         self.ends, self.ramp = ends, ramp
         channels = [dim * (1 + len(ends)), *(width * m for m in multipliers)]
-        levels = list(zip(channels[:-1], channels[1:], strict=True))
+        levels = list(pairwise(channels))
         self.stride = 2 ** (len(levels) - 1)
         self.embed = nn.Sequential(SinusoidalStep(width), nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
         self.down = nn.ModuleList(
@@ -66,13 +68,13 @@ class TemporalUnet(nn.Module):
         h = torch.cat((x, *(state.expand_as(x) for state in pinned)), -1).transpose(1, 2)
         step = self.embed(t)
         skips = []
-        for first, second, shrink in self.down:
+        for first, second, shrink in cast(Any, self.down):
             h = second(first(h, step), step)
             skips.append(h)
             h = shrink(h)
         for block in self.middle:
             h = block(h, step)
-        for first, second, grow in self.up:
+        for first, second, grow in cast(Any, self.up):
             h = second(first(torch.cat((h, skips.pop()), 1), step), step)
             h = grow(h)
         estimate = self.head(h).transpose(1, 2).to(x)
@@ -98,7 +100,7 @@ class SinusoidalStep(nn.Module):
         self.register_buffer("frequency", torch.exp(torch.arange(half) * (-math.log(10000) / (half - 1))), persistent=False)
 
     def forward(self, t: Tensor) -> Tensor:
-        angle = t[:, None] * self.frequency
+        angle = t[:, None] * cast(Tensor, self.frequency)
         return torch.cat((angle.sin(), angle.cos()), -1)
 
 

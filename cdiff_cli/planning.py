@@ -112,7 +112,7 @@ def plan(
     shape = (problem.horizon, dim)
     total = problem.schedule.n_steps + extra_steps
     keep_chain = total * len(seeds) * problem.horizon * dim <= 4_000_000
-    trace, chain, network_s = [], [], 0.0
+    trace, chain, network_s, watching_s = [], [], 0.0, 0.0
 
     def timed(x: Traj, t: int) -> Traj:
         nonlocal network_s
@@ -135,14 +135,11 @@ def plan(
             on_step(call)
         watching_s += time.perf_counter() - began
 
-    watching_s = 0.0
     synchronise(device)
     began = time.perf_counter()
     with torch.inference_mode():
         noise = Noise(seeds, shape, device)
-        z = sample(
-            timed, problem.schedule, method, g, pins, noise, kernel=KERNELS[kernel], extra_steps=extra_steps, on_step=record
-        )
+        z = sample(timed, problem.schedule, method, g, pins, noise, kernel=KERNELS[kernel], extra_steps=extra_steps, on_step=record)
         if not bool(torch.isfinite(z).all()):
             bad = [seed for seed, x in zip(seeds, z, strict=True) if not bool(torch.isfinite(x).all())]
             raise CdiffError(
@@ -214,9 +211,7 @@ class Rollout:
     goal_distance: Array
 
 
-def follow(
-    task: Any, plans: Array, seeds: Sequence[int], hold: int = 100, on_step: Callable[[int], None] | None = None
-) -> Rollout:
+def follow(task: Any, plans: Array, seeds: Sequence[int], hold: int = 100, on_step: Callable[[int], None] | None = None) -> Rollout:
     """Follow each plan in the task's environment with its tracking controller, then hold at the last waypoint."""
     env = task.make_env().unwrapped
     episodes: list[Mapping[str, Array]] = []

@@ -210,6 +210,7 @@ def _sequential(g: Constraint, z: Traj, pins: Pins, tolerance: float, rounds: in
     for b in range(len(z)):
         free = ~pins.mask.flatten().cpu().numpy()
         target = z[b].double().cpu().numpy().ravel()
+        matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
         x = out[b : b + 1].double()
         one = Pins(pins.mask, x)
         g64 = g.to(x)
@@ -221,9 +222,9 @@ def _sequential(g: Constraint, z: Traj, pins: Pins, tolerance: float, rounds: in
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # ProxQP's format advice
                 step = qpsolvers.solve_qp(
-                    sparse.eye(int(free.sum()), format="csc"),
+                    matrix(np.eye(int(free.sum()))),
                     -target[free],
-                    sparse.csc_matrix(jacobian[useful]),
+                    matrix(jacobian[useful]),
                     slack[useful],
                     solver="proxqp",
                     eps_abs=min(tolerance, 1e-9),

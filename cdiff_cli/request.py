@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -154,7 +154,7 @@ def needed_speed(resolved: Resolved) -> tuple[float, float] | None:
     if problem.start is None or problem.goal is None or resolved.checkpoint is None or resolved.options.random:
         return None
     columns = [task.layout.index(name) for name in task.positions]
-    length = task.path_length(problem.start[columns], problem.goal[columns])
+    length = cast(Any, task).path_length(problem.start[columns], problem.goal[columns])
     return length / ((problem.horizon - 1) * task.dt), resolved.checkpoint.card.data["speed_q95"]
 
 
@@ -178,7 +178,9 @@ def parse_state(flag: str, text: str | None, default: dict[str, float] | None, t
         name, equals, number = piece.rpartition("=")
         name = name.strip() if equals else task.positions[i] if i < len(task.positions) else ""
         if name not in task.layout:
-            raise CdiffError(f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} as 0.3,-1.2 or x=0.3,y=-1.2')
+            raise CdiffError(
+                f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} as 0.3,-1.2 or x=0.3,y=-1.2'
+            )
         try:
             values[name] = float(number)
         except ValueError:

@@ -108,10 +108,11 @@ def read_rows(path: Path) -> list[Row]:
     """Rows with their metrics as numbers; CdiffError where the file is not one of ours."""
     try:
         with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-    except OSError as error:
+            reader = csv.DictReader(file)
+            numbered = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CdiffError(f"{path}: cannot be read: {error}") from None
-    for number, row in enumerate(rows, start=2):
+    for number, row in numbered:
         if any(row.get(key) is None for key in KEYS):
             raise CdiffError(f"{path}:{number}: not a row of a run: it lacks {', '.join(k for k in KEYS if row.get(k) is None)}")
         for name in row:
@@ -120,7 +121,7 @@ def read_rows(path: Path) -> list[Row]:
                     row[name] = float(row[name])
                 except ValueError:
                     raise CdiffError(f"{path}:{number}: {name} is not a number: {row[name]!r}") from None
-    return rows
+    return [row for _, row in numbered]
 
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:

@@ -157,7 +157,7 @@ def kinds() -> tuple[type[Strict], ...]:
 
 def file_model() -> type[Strict]:
     """The model of a whole constraint file."""
-    union = Annotated[Union[kinds()], Field(discriminator="kind")]  # type: ignore[valid-type]  # noqa: UP007
+    union: Any = Annotated[Union[kinds()], Field(discriminator="kind")]  # noqa: UP007
     fields: Any = {
         "task": (str, Field(description="the task whose coordinates the constraints name")),
         "constraints": (list[union], Field(description="all of them hold at once")),

@@ -69,4 +69,3 @@ def load_task(name: str) -> Any:
         raise CdiffError(f'no task "{name}"{suggestion(name, TASKS)}; choose from {", ".join(TASKS)}')
     module, attribute = TASKS[name].split(":")
     return getattr(importlib.import_module(module), attribute)
-

@@ -50,10 +50,10 @@ class Gaussian2D:
     def walls(self) -> NDArray[np.float64]:
         return np.empty((0, 4))
 
-    def make_env(self, render: bool = False) -> Any:  # noqa: ARG002
+    def make_env(self, render: bool = False) -> Any:
         raise CdiffError("gaussian2d is a distribution, not an environment: it can be planned, not rolled out or trained")
 
-    def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]:  # noqa: ARG002
+    def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]:
         raise CdiffError("gaussian2d needs no training: its score is exact")
 
     def observe(self, obs: Any) -> NDArray[np.float64]:

@@ -4,7 +4,10 @@ Frame: cell centres at x = column + 0.5 - W / 2, y = H / 2 - row - 0.5 (metres),
 dt 0.01 s, force in [-1, 1] on each axis, speed clipped at 5 m/s on each axis.
 """
 
+import contextlib
 import heapq
+import io
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -46,10 +49,12 @@ class Maze2D:
 
     def make_env(self, render: bool = False, max_steps: int = 10**9) -> Any:
         """The Gymnasium environment, continuing (it never resets the goal by itself)."""
-        import gymnasium
-        import gymnasium_robotics
+        with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+            warnings.simplefilter("ignore")  # their import tells of other environments' versions
+            import gymnasium
+            import gymnasium_robotics
 
-        gymnasium.register_envs(gymnasium_robotics)
+            gymnasium.register_envs(gymnasium_robotics)
         return gymnasium.make(
             self.env_id,
             continuing_task=True,
@@ -159,12 +164,11 @@ class Maze2D:
             obs, _ = env.reset(seed=int(rng.integers(2**31)))
             steps = min(episode_steps, n_steps - first)
             rows: dict[str, list[Any]] = {"observations": [obs], "actions": [], "rewards": []}
-            trip: Iterator[Array] = iter(())
             while len(rows["actions"]) < steps:
                 goal = self.random_point(rng)
                 env.goal = goal
-                trip = self._trip(lambda: rows["observations"][-1]["observation"], goal, rng)
-                for u in trip:
+                seen = rows["observations"]
+                for u in self._trip(lambda seen=seen: seen[-1]["observation"], goal, rng):  # type: ignore[misc]
                     obs, reward, _, _, _ = env.step(u.astype(np.float32))
                     rows["observations"].append(obs)
                     rows["actions"].append(u.astype(np.float32))

@@ -1,0 +1,31 @@
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BIN := .venv/bin
+
+.PHONY: demo test lint tables benchmark clean
+
+demo: .venv/.ready  ## plan on the shipped model with every method, compare
+	$(BIN)/cdiff plan --method diffuser --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method projected --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method primal-dual --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method alm --runs runs/demo
+	$(BIN)/cdiff compare runs/demo
+
+test: lint  ## lint, types, tests
+	$(BIN)/python -m pytest -n 2 -q
+
+lint: .venv/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+benchmark: .venv/.ready  ## timings, as ratios within one run
+	$(BIN)/python tests/benchmarks/constraint_share.py
+
+.venv/.ready: requirements.txt pyproject.toml
+	test -d .venv || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install -q --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install -q --disable-pip-version-check --no-build-isolation --no-deps -e .
+	touch $@
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis
