@@ -2,6 +2,7 @@
 
 import functools
 import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,8 @@ app = typer.Typer(
     help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
     epilog="Start with: cdiff plan --method alm",
 )
-out, err = Console(), Console(stderr=True)
+err = Console(stderr=True)
+out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width of its own
 
 RUNS = Path("runs")
 TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large or gaussian2d")]

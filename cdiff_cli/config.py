@@ -42,7 +42,8 @@ class Document:
         try:
             node = yaml.compose(text, Loader=Loader)
             self.value = yaml.load(text, Loader=Loader)
-            self._refuse_duplicates(self.node)
+            if node is not None:
+                self._refuse_duplicates(node)
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
             line = f":{mark.line + 1}" if mark else ""

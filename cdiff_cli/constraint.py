@@ -52,6 +52,10 @@ class Level(Protocol):
         """df/dx [..., dim]."""
         ...
 
+    def size(self, x: Tensor) -> Tensor:
+        """|df/dx|^2 [...], plus |f| times the largest curvature, so that f / size is a safe step where the gradient fades."""
+        ...
+
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Level":
         """f(centre + scale * z) as a function of z."""
         ...
@@ -78,6 +82,9 @@ class Affine:
     def gradient(self, x: Tensor) -> Tensor:
         return self.a.expand_as(x)
 
+    def size(self, x: Tensor) -> Tensor:
+        return (self.a @ self.a).expand(x.shape[:-1])
+
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Affine":
         return Affine(self.a * scale, self.b - self.a @ centre)
 
@@ -101,6 +108,9 @@ class Quadric:
 
     def gradient(self, x: Tensor) -> Tensor:
         return 2 * x @ self.P + self.q
+
+    def size(self, x: Tensor) -> Tensor:
+        return self.gradient(x).square().sum(-1) + 2 * torch.linalg.matrix_norm(self.P) * self(x).abs()
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Quadric":
         P = scale[:, None] * self.P * scale
@@ -145,6 +155,9 @@ class Ellipsoid:
         y = self._scaled(x)
         unit = y / y.norm(dim=-1, keepdim=True).clamp_min(1e-12)
         return (-self.side * self.m * unit / self.axes) @ self.which
+
+    def size(self, x: Tensor) -> Tensor:
+        return self.gradient(x).square().sum(-1)
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Ellipsoid":
         s = self.which @ scale
@@ -208,7 +221,7 @@ class Waypoints:
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
         slope = self.level.gradient(x)
-        return self.level(x), lambda w: w[..., None] * slope, slope.square().sum(-1)
+        return self.level(x), lambda w: w[..., None] * slope, self.level.size(x)
 
     def map(self, change: Callable[[Level], Level]) -> "Waypoints":
         return replace(self, level=change(self.level))
@@ -246,7 +259,7 @@ class Chain:
             out[:, 1:] += w[..., None] * slope[:, 1:]
             return out
 
-        size = slope.square().sum(-1)
+        size = self.level.size(x)
         return self(x), pull, (1 + keep) ** 2 * torch.maximum(size[:, :-1], size[:, 1:])
 
     def map(self, change: Callable[[Level], Level]) -> "Chain":

@@ -148,7 +148,7 @@ class Cell:
     def text(self, digits: int) -> str:
         mean = f"{self.mean:.{digits}f}"
         mean = mean.lstrip("-") if float(mean) == 0 else mean
-        if self.n < 2 or (self.error == 0 and digits == 0):
+        if self.n < 2 or (self.error == 0 and self.mean != 0):  # one value, or one for the whole batch: times, calls
             return mean
         return f"{mean} ± {self.error:.{digits}f}"
 

@@ -108,7 +108,8 @@ def train(
             if fit.step % save_every == 0:
                 fit.save(work / "state.safetensors")
     except BaseException:
-        fit.save(work / "state.safetensors")
+        if fit.rewind():
+            fit.save(work / "state.safetensors")
         raise
     fit.save(work / "state.safetensors")
     card = {
@@ -160,6 +161,8 @@ class _Fit:
     loss_average: float = math.nan
     mse_average: float = math.nan
     wall_s: float = 0.0
+    drawn_from: Tensor | None = None  # the generator before the step under way
+    whole: bool = True  # no update is under way
 
     @classmethod
     def start(cls, dim: int, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
@@ -177,6 +180,7 @@ class _Fit:
         for group in self.optimiser.param_groups:
             group["lr"] = spec.learning_rate * self._rate()
         self.optimiser.zero_grad()
+        self.drawn_from = self.generator.get_state()
         for _ in range(spec.accumulate):
             x0 = windows.draw(spec.batch, self.generator).to(self.device)
             loss, mse = training_loss(self.net, schedule, x0, pinned, spec.smoothness, self.generator, spec.bf16)
@@ -186,6 +190,7 @@ class _Fit:
             raise CdiffError(f"the loss is {loss_value} at step {self.step}: training diverged; lower learning_rate")
         if spec.clip is not None:
             nn.utils.clip_grad_norm_(self.net.parameters(), spec.clip)
+        self.whole = False
         self.optimiser.step()
         self.step += 1
         decay = min(spec.ema, self.step / (self.step + 10))
@@ -194,7 +199,14 @@ class _Fit:
                 mean.lerp_(new, 1 - decay)
         self.loss_average = _average(self.loss_average, loss_value)
         self.mse_average = _average(self.mse_average, mse_value)
+        self.drawn_from, self.whole = None, True
         return loss_value
+
+    def rewind(self) -> bool:
+        """Undo the draws of a step broken off; False where its update had begun, so that the state is of no use."""
+        if self.drawn_from is not None:
+            self.generator.set_state(self.drawn_from)
+        return self.whole
 
     def _rate(self) -> float:
         """Learning rate as a share of the recipe's: a short warm-up, then a cosine to zero."""
@@ -216,7 +228,7 @@ class _Fit:
         for name, mine in (("seed", str(self.seed)), ("data_sha256", self.data_sha256), ("spec", self.spec.model_dump_json())):
             if facts.get(name) != mine:
                 raise CheckpointError(
-                    f"{shown(path)}: its {name} is {facts.get(name)}, this training has {mine}; train without --resume, or as before"
+                    f"{shown(path)}: its {name} is {facts.get(name)}, here it is {mine}; leave --resume out, or train as before"
                 )
         self.net.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("net.")})
         self.ema.load_state_dict({k[4:]: v for k, v in tensors.items() if k.startswith("ema.")})
@@ -245,7 +257,8 @@ def data_statistics(task: Task, episodes: list[Any], horizon: int) -> dict[str, 
         rate = [task.layout.index(name) for name in task.velocities]
         change = np.concatenate([np.linalg.norm(np.diff(e[:, rate], axis=0), axis=1) for e in episodes]) / task.dt
         facts |= {"acceleration_q999": np.quantile(change, 0.999), "acceleration_max": change.max()}
-    travelled = [np.convolve(np.linalg.norm(np.diff(e[:, at], axis=0), axis=1), np.ones(horizon - 1), "valid") for e in episodes]
+    long = [e for e in episodes if len(e) >= horizon]
+    travelled = [np.convolve(np.linalg.norm(np.diff(e[:, at], axis=0), axis=1), np.ones(horizon - 1), "valid") for e in long]
     speed = np.concatenate(travelled) / ((horizon - 1) * task.dt)
     facts |= {"speed_q50": np.quantile(speed, 0.5), "speed_q95": np.quantile(speed, 0.95), "speed_max": speed.max()}
     return {name: round(float(value), 5) for name, value in facts.items()}

@@ -130,9 +130,9 @@ reals = st.floats(-10, 10)
 def test_both_forms_of_a_ball_agree_in_sign_and_distance_is_metric(cx, cy, radius, x, y):
     state = torch.tensor([[[x, y, 0.0, 0.0]]], dtype=torch.float64)
     distance, squared = (
-        cdiff_cli.spec.Quadratic(
-            kind="quadratic", side="outside", centre={"x": cx, "y": cy}, radius=radius, form=form
-        ).compile(LAYOUT)(state)
+        cdiff_cli.spec.Quadratic(kind="quadratic", side="outside", centre={"x": cx, "y": cy}, radius=radius, form=form).compile(
+            LAYOUT
+        )(state)
         for form in ("distance", "squared")
     )
     away = ((x - cx) ** 2 + (y - cy) ** 2) ** 0.5
@@ -236,7 +236,10 @@ MISTAKES = {
         item(*DISC[:2], "P: {x: {x: 1.0}}", "r: 1.0", "form: distance"),
         "4 constraints[1]: P, q, r has no distance form",
     ),
-    "unknown side": (item("kind: quadratic", "side: left", DISC[2], "radius: 1.0"), "5 constraints[1].side: expected 'outside'"),
+    "unknown side": (
+        item("kind: quadratic", "side: left", DISC[2], "radius: 1.0"),
+        "5 constraints[1].side: expected 'outside'",
+    ),
     "malformed YAML": (HEAD + "  - {kind: linear\n    a: [}\n", "5: not valid YAML: "),
 }
 

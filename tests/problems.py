@@ -1,0 +1,152 @@
+"""Named problems with known answers, and short constructors, for all tests."""
+
+import math
+
+import numpy as np
+import qpsolvers
+import torch
+
+from cdiff_cli.constraint import Affine, Chain, Constraint, Ellipsoid, Opaque, Pins, Quadric, Waypoints
+from cdiff_cli.diffusion import Step
+
+LAYOUT = ("x", "y", "vx", "vy")
+F64 = torch.float64
+
+
+def vec(*values):
+    return torch.tensor(values, dtype=F64)
+
+
+def num(value):
+    return torch.tensor(value, dtype=F64)
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(seed, *shape, scale=1.0):
+    return scale * torch.randn(*shape, generator=generator(seed), dtype=F64)
+
+
+# levels and constraints -----------------------------------------------------------------------------------------------
+
+
+def half_space(a=(1.0, -1.0), b=0.2):
+    return Affine(vec(*a), num(b))
+
+
+def ball(side, centre=(0.3, -0.2), radius=0.7, dim=None):
+    k, dim = len(centre), dim or len(centre)
+    return Ellipsoid(torch.eye(k, dim, dtype=F64), vec(*centre), torch.full((k,), radius, dtype=F64), num(radius), side)
+
+
+def ellipsoid(side, centre=(0.3, -0.2), axes=(0.5, 1.2)):
+    return Ellipsoid(torch.eye(len(axes), dtype=F64), vec(*centre), vec(*axes), num(min(axes)), side)
+
+
+def saddle():
+    """x^2 - 0.5 y^2 + 0.6 x y + 0.3 x - 0.1 y <= 0.4: neither convex nor the complement of a convex set."""
+    return Quadric(torch.tensor([[1.0, 0.3], [0.3, -0.5]], dtype=F64), vec(0.3, -0.1), num(0.4))
+
+
+LEVELS = {
+    "half-space": half_space(),
+    "inside ball": ball(-1),
+    "outside ball": ball(1),
+    "inside ball squared": ball(-1).quadric(),
+    "outside ball squared": ball(1).quadric(),
+    "inside ellipsoid": ellipsoid(-1),
+    "outside ellipsoid": ellipsoid(1),
+    "general quadric": saddle(),
+}
+
+
+def waypoints(level, name="w"):
+    return Constraint((Waypoints(name, level),))
+
+
+def chain(level, alpha, name="c"):
+    return Constraint((Chain(name, level, alpha),))
+
+
+def opaque(fn, name="o"):
+    return Constraint((Opaque(name, fn, lambda horizon: horizon),))
+
+
+KINDS = {
+    **{name: waypoints(level) for name, level in LEVELS.items()},
+    **{f"dcbf over {name}": chain(level, 0.3) for name, level in LEVELS.items()},
+    "opaque": opaque(lambda x: (x**3).sum(-1) - 0.5),
+    "stack": Constraint((Waypoints("a", half_space()), Chain("b", ball(1), 0.4), Waypoints("e", ellipsoid(-1)))),
+}
+
+
+# pins -----------------------------------------------------------------------------------------------------------------
+
+
+def pin(x, *waypoints, columns=None):
+    """x's own values held at these waypoints."""
+    mask = torch.zeros(x.shape[1:], dtype=torch.bool)
+    for tau in waypoints:
+        mask[tau, columns if columns is not None else slice(None)] = True
+    return Pins(mask, x)
+
+
+# references -----------------------------------------------------------------------------------------------------------
+
+
+def qp_project(A, b, z, fixed=None):
+    """min |x - z|^2 s.t. A x <= b, x = z where fixed; by ProxQP's dense backend, about 1e-9 exact."""
+    E = np.eye(len(z))[fixed] if fixed is not None and fixed.any() else None
+    x = qpsolvers.solve_qp(
+        np.eye(len(z)), -z, A, b, E, None if E is None else z[fixed], solver="proxqp", eps_abs=1e-10, eps_rel=0.0
+    )
+    assert x is not None
+    return x
+
+
+def dense_jacobian(g, x):
+    """(J, offset) with g(x) = J x + offset, of affine rows, for one plan [1, horizon, dim]."""
+    J = torch.autograd.functional.jacobian(lambda v: g(v.reshape(x.shape))[0], x.flatten())
+    return J.numpy(), (g(x)[0] - J @ x.flatten()).numpy()
+
+
+def nearest_of(points, z):
+    """The least distance from z [n, 2] to a cloud of points [m, 2]."""
+    return torch.cdist(z, points).min(1).values
+
+
+# samplers with known answers ------------------------------------------------------------------------------------------
+
+UNIT_MEAN_SHIFT = waypoints(Affine(vec(-1.0), num(-1.0)))  # g(x) = 1 - x: E x >= 1 turns N(0, 1) into N(1, 1), lam* = 1
+
+
+def langevin_chain(method, g, *, steps, batch, beta, seed):
+    """Unadjusted Langevin of N(0, 1) under `method`: final samples [batch, 1, 1] and the state after each step."""
+    rng = generator(seed)
+    x = torch.randn(batch, 1, 1, generator=rng, dtype=F64)
+    pins, state, states = Pins.none(x), method.init(x, g), []
+    for _ in range(steps):
+        z = torch.randn(x.shape, generator=rng, dtype=F64)
+        step = Step(x, x, beta, lambda _, x=x, z=z: x - beta / 2 * x + math.sqrt(beta) * z, pins, False)
+        x, state = method.step(step, g, state)
+        states.append(state)
+    return x, states
+
+
+def gaussian_denoiser(schedule, mean, std):
+    """E[x_0 | x_t] of N(mean, std^2), exactly."""
+    level = dict(zip(schedule.t, schedule.alpha_bar, strict=True))
+
+    def clean(x, t):
+        a = level[t]
+        return mean + std**2 * math.sqrt(a) / (a * std**2 + 1 - a) * (x - math.sqrt(a) * mean)
+
+    return clean
+
+
+def draws(seed, *shape):
+    """A noise source of one generator, float64."""
+    rng = generator(seed)
+    return lambda: torch.randn(*shape, generator=rng, dtype=F64)
