@@ -1,5 +1,6 @@
 """YAML files into pydantic models, with errors that name file, line and field."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,13 +20,16 @@ class Strict(BaseModel):
 
 
 class Loader(yaml.SafeLoader):
-    """SafeLoader with the booleans of YAML 1.2: only true and false, so that `on: clean` has the key "on"."""
+    """SafeLoader with the booleans and floats of YAML 1.2: `on: clean` has the key "on", and 1e-3 is a number."""
 
 
 Loader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool" or first in "tTfF"]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
+Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\.\d+|\d+(\.\d*)?)[eE][-+]?\d+$"), list("-+.0123456789")
+)
 
 
 class Document:

@@ -81,6 +81,8 @@ def train(
     work holds state.safetensors, written every save_every steps and on interruption; resume goes on from there and, on one
     CPU with as many threads, ends with the same bits as an uninterrupted run.
     """
+    if not recipe.train:
+        raise CdiffError(f"{task.name} needs no training: its score is exact")
     if size not in recipe.train:
         raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
     spec = recipe.train[size]

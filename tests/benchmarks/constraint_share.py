@@ -28,7 +28,12 @@ for preset in ("paper", "released", "recommended"):
         measured = []
         for _ in range(arguments.repeats + 1):
             plans = plan(
-                resolved.problem, resolved.method, resolved.seeds, kernel=resolved.kernel, extra_steps=extra, polish=resolved.preset.polish
+                resolved.problem,
+                resolved.method,
+                resolved.seeds,
+                kernel=resolved.kernel,
+                extra_steps=extra,
+                polish=resolved.preset.polish,
             )
             outside = plans.total_s - plans.network_s
             measured.append((1e3 * plans.network_s / plans.calls, 1e3 * outside / plans.calls, 100 * outside / plans.network_s))

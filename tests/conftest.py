@@ -1,0 +1,5 @@
+"""One thread a test process: the suite runs two of them, and equal seeds must give equal plans whatever the machine."""
+
+import torch
+
+torch.set_num_threads(1)
