@@ -42,7 +42,7 @@ def test_calls_count_the_extra_steps(umaze):
 
 
 def test_a_diverged_plan_is_said_aloud(umaze):
-    broken = replace(umaze.problem, denoiser=lambda x, t: x * float("nan"))
+    broken = replace(umaze.problem, denoiser=lambda x, _: x * float("nan"))
     with pytest.raises(CdiffError, match=r"seeds \[0\] diverged to NaN"):
         plan(broken, Unconstrained(), [0])
 
