@@ -1,6 +1,7 @@
 """Demonstrations: episodes of states from Minari or HDF5, the affine normaliser, windows of one horizon."""
 
 import hashlib
+import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -106,13 +107,14 @@ class Windows:
 
 def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None = None) -> list[Array]:
     """The task's own demonstrations as episodes of states [steps + 1, dim]: generated once as the local Minari dataset
-    `cdiff/<task>-v0`, reused when its steps, seed and content hash are the expected ones.
+    `cdiff/<task>-v0`, reused when its steps, seed, generating code and content hash are the expected ones.
     """
     minari = _minari()
     name = f"cdiff/{task.name}-v0"
+    recipe = {"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_code": _code(task)}
     if name in minari.list_local_datasets():
         episodes, metadata = _minari_episodes(minari, name, task)
-        asked = {"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_sha256": digest(episodes)}
+        asked = recipe | {"cdiff_sha256": digest(episodes)}
         if {key: metadata.get(key) for key in asked} == asked:
             return episodes
         minari.delete_dataset(name)
@@ -134,7 +136,7 @@ def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None 
             data_format="hdf5",
         )
     episodes, _ = _minari_episodes(minari, name, task)
-    dataset.storage.update_metadata({"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_sha256": digest(episodes)})
+    dataset.storage.update_metadata(recipe | {"cdiff_sha256": digest(episodes)})
     return episodes
 
 
@@ -159,6 +161,11 @@ def digest(episodes: Sequence[Array]) -> str:
     for episode in episodes:
         sha.update(np.ascontiguousarray(episode, dtype=np.float64).tobytes())
     return sha.hexdigest()
+
+
+def _code(task: Task) -> str:
+    """Hash of the file that generates the demonstrations: edited code must not meet its old data."""
+    return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
 def _minari() -> Any:
