@@ -1,7 +1,9 @@
 """Demonstrations: episodes of states from Minari or HDF5, the affine normaliser, windows of one horizon."""
 
+import contextlib
 import hashlib
 import inspect
+import io
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -117,7 +119,8 @@ def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None 
         asked = recipe | {"cdiff_sha256": digest(episodes)}
         if {key: metadata.get(key) for key in asked} == asked:
             return episodes
-        minari.delete_dataset(name)
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints
+            minari.delete_dataset(name)
     buffers, done = [], 0
     for number, rows in enumerate(task.demonstrate(steps, seed)):
         buffers.append(_episode_buffer(rows, number))

@@ -274,6 +274,7 @@ def write_safetensors(path: Path, tensors: dict[str, Tensor], facts: dict[str, s
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         save_file(tensors, partial, facts)
+        partial.chmod(0o644)
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
@@ -313,7 +314,8 @@ def install(checkpoint: Checkpoint) -> Path:
     target = folder / f"{checkpoint.card.recipe}.safetensors"
     if target.exists():
         previous = folder / f"{checkpoint.card.recipe}.previous.safetensors"
-        os.replace(card_path(target), card_path(previous))
+        if card_path(target).exists():
+            os.replace(card_path(target), card_path(previous))
         os.replace(target, previous)
     tensors, _ = read_safetensors(checkpoint.path, "train again")
     save_checkpoint(target, tensors, checkpoint.card.model_dump(mode="json"))
