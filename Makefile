@@ -1,13 +1,14 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
+TIGHT := --constraints constraints/maze2d-umaze-tight.yaml
 
-.PHONY: demo test lint tables benchmark clean
+.PHONY: demo test lint benchmark clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
-	$(BIN)/cdiff plan --method diffuser --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method projected --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method primal-dual --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method alm --runs runs/demo
+	$(BIN)/cdiff plan --method diffuser $(TIGHT) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method projected $(TIGHT) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method primal-dual $(TIGHT) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method alm $(TIGHT) --runs runs/demo
 	$(BIN)/cdiff compare runs/demo
 
 test: lint  ## lint, types, tests
