@@ -21,7 +21,7 @@ from cdiff_cli.data import Normaliser, Progress, Windows, demonstrations, digest
 from cdiff_cli.diffusion import Schedule, training_loss
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.networks import TemporalUnet
-from cdiff_cli.recipe import Card, NetworkSpec, Recipe, TrainSpec, home, shown
+from cdiff_cli.recipe import Card, Recipe, TrainSpec, home, shown
 from cdiff_cli.tasks import Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
@@ -346,10 +346,6 @@ def load_checkpoint(path: Path, task: str | None = None, device: torch.device | 
     net = TemporalUnet(windows.shape[-1], card.network.width, card.network.multipliers)
     net.load_state_dict({name.removeprefix("net."): value for name, value in tensors.items()})
     return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path)
-
-
-def network_spec(checkpoint: Checkpoint) -> NetworkSpec:
-    return checkpoint.card.network
 
 
 def git_commit() -> str:
