@@ -86,12 +86,6 @@ def new_run(root: Path, name: str) -> Iterator[NewRun]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def latest(root: Path) -> Path | None:
-    """The newest finished run with rows under root."""
-    runs = [path.parent for path in find_rows(root)]
-    return max(runs, key=lambda path: (path.name[:15], path.stat().st_mtime)) if runs else None
-
-
 def find_rows(root: Path) -> list[Path]:
     """All rows.csv below root, those of unfinished runs left out."""
     return sorted(p for p in root.glob("*/rows.csv") if not p.parent.name.startswith("."))

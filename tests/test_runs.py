@@ -1,7 +1,6 @@
 """Run directories, their rows, and the comparison of many runs."""
 
 import math
-import os
 import types
 
 import pytest
@@ -16,7 +15,6 @@ from cdiff_cli.runs import (
     Cell,
     compare,
     find_rows,
-    latest,
     merge_kinds,
     new_run,
     read_rows,
@@ -75,21 +73,7 @@ def test_an_unfinished_run_is_not_found(tmp_path):
     with new_run(tmp_path, "plan") as run:
         write_rows(run.path / "rows.csv", [row()])
         assert find_rows(tmp_path) == []
-        assert latest(tmp_path) is None
     assert find_rows(tmp_path) == [run.path / "rows.csv"]
-    assert latest(tmp_path) == run.path
-
-
-def test_latest_goes_by_the_time_in_the_name(tmp_path):
-    for name in ("20250102-120000-plan", "20250103-120000-plan", "20241231-120000-plan"):
-        (tmp_path / name).mkdir()
-        write_rows(tmp_path / name / "rows.csv", [row()])
-    os.utime(tmp_path / "20241231-120000-plan")
-    assert latest(tmp_path) == tmp_path / "20250103-120000-plan"
-
-
-def test_there_is_no_latest_run_of_a_missing_folder(tmp_path):
-    assert latest(tmp_path / "none") is None
 
 
 # rows -----------------------------------------------------------------------------------------------------------------
