@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -109,9 +110,17 @@ class Windows:
 
 def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None = None) -> list[Array]:
     """The task's own demonstrations as episodes of states [steps + 1, dim]: generated once as the local Minari dataset
-    `cdiff/<task>-v0`, reused when its steps, seed, generating code and content hash are the expected ones.
+    `cdiff/<task>-v0`, reused when its steps, seed, generating code and content hash are the expected ones. Processes that
+    ask at the same time wait for the first.
     """
     minari = _minari()
+    root = Path(minari.storage.get_dataset_path())
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / f".cdiff-{task.name}.lock"):
+        return _stored_demonstrations(minari, task, steps, seed, progress)
+
+
+def _stored_demonstrations(minari: Any, task: Task, steps: int, seed: int, progress: Progress | None) -> list[Array]:
     name = f"cdiff/{task.name}-v0"
     recipe = {"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_code": _code(task)}
     if name in minari.list_local_datasets():

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from cdiff_cli.config import Strict, load
 from cdiff_cli.errors import CdiffError
@@ -15,8 +15,8 @@ Positive = Annotated[int, Field(gt=0)]
 class NetworkSpec(Strict):
     """Size of the TemporalUnet."""
 
-    width: Positive = 32
-    multipliers: tuple[Positive, ...] = (1, 2, 4)
+    width: Annotated[int, Field(gt=0, multiple_of=8)] = 32  # the channels are normalised in 8 groups
+    multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
 
 
 class TrainSpec(Strict):
@@ -72,6 +72,16 @@ class Recipe(Strict):
     train: dict[str, TrainSpec] = {}
     presets: dict[str, Preset]
     paper_units: PaperUnits = PaperUnits()
+
+    @model_validator(mode="after")
+    def _horizon_divides(self) -> "Recipe":
+        for name, spec in self.train.items():
+            halvings = len(spec.network.multipliers) - 1
+            if self.horizon % 2**halvings:
+                raise ValueError(
+                    f"train.{name}: its network halves the horizon {halvings} times, which {self.horizon} does not allow"
+                )
+        return self
 
 
 class Card(Strict):

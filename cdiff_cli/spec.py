@@ -160,7 +160,7 @@ def file_model() -> type[Strict]:
     union: Any = Annotated[Union[kinds()], Field(discriminator="kind")]  # noqa: UP007
     fields: Any = {
         "task": (str, Field(description="the task whose coordinates the constraints name")),
-        "constraints": (list[union], Field(description="all of them hold at once")),
+        "constraints": (list[union], Field(min_length=1, description="all of them hold at once")),
     }
     return create_model("ConstraintFile", __base__=Strict, **fields)
 

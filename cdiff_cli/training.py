@@ -95,7 +95,7 @@ def train(
         columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
         windows = windows.favour_trips(spec.trips, *columns)
     commit = git_commit()
-    fit = _Fit.start(len(task.layout), spec, seed, device, digest(episodes))
+    fit = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
         fit.load(work / "state.safetensors")
     schedule, pinned = Schedule.cosine(recipe.n_steps), end_pins(recipe.horizon, len(task.layout)).to(device)
@@ -156,6 +156,8 @@ class _Fit:
     optimiser: torch.optim.Adam
     generator: torch.Generator
     spec: TrainSpec
+    horizon: int
+    n_steps: int
     device: torch.device
     seed: int
     data_sha256: str
@@ -167,14 +169,15 @@ class _Fit:
     whole: bool = True  # no update is under way
 
     @classmethod
-    def start(cls, dim: int, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
+    def start(cls, dim: int, recipe: Recipe, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # weight initialisation draws from the global generator; fork_rng restores it
             net, ema = (TemporalUnet(dim, spec.network.width, spec.network.multipliers) for _ in range(2))
         ema.load_state_dict(net.state_dict())
         net, ema = net.to(device), ema.to(device).requires_grad_(False)
         optimiser = torch.optim.Adam(net.parameters(), spec.learning_rate)
-        return cls(net, ema, optimiser, torch.Generator().manual_seed(seed), spec, device, seed, data_sha256)
+        generator = torch.Generator().manual_seed(seed)
+        return cls(net, ema, optimiser, generator, spec, recipe.horizon, recipe.n_steps, device, seed, data_sha256)
 
     def advance(self, windows: Windows, schedule: Schedule, pinned: Tensor) -> float:
         """One optimiser step; returns the loss."""
@@ -215,19 +218,23 @@ class _Fit:
         warm = min(1.0, (self.step + 1) / 200)
         return warm if self.spec.schedule == "constant" else warm * (0.5 + 0.5 * math.cos(math.pi * self.step / self.spec.steps))
 
+    def _task(self) -> dict[str, str]:
+        """What a resumed training must share with the one it goes on from."""
+        facts = {k: str(getattr(self, k)) for k in ("seed", "data_sha256", "horizon", "n_steps")}
+        return facts | {"spec": self.spec.model_dump_json()}
+
     def save(self, path: Path) -> None:
         tensors = {f"net.{k}": v for k, v in self.net.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.state_dict().items()}
         for index, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{k}": v for k, v in state.items()}
         tensors["generator"] = self.generator.get_state()
-        facts = {k: str(getattr(self, k)) for k in ("step", "loss_average", "mse_average", "wall_s", "seed", "data_sha256")}
-        facts["spec"] = self.spec.model_dump_json()
+        facts = {k: str(getattr(self, k)) for k in ("step", "loss_average", "mse_average", "wall_s")} | self._task()
         write_safetensors(path, {k: v.cpu().contiguous() for k, v in tensors.items()}, facts)
 
     def load(self, path: Path) -> None:
         tensors, facts = read_safetensors(path, "start without --resume to train from the beginning")
-        for name, mine in (("seed", str(self.seed)), ("data_sha256", self.data_sha256), ("spec", self.spec.model_dump_json())):
+        for name, mine in self._task().items():
             if facts.get(name) != mine:
                 raise CheckpointError(
                     f"{shown(path)}: its {name} is {facts.get(name)}, here it is {mine}; leave --resume out, or train as before"
@@ -343,7 +350,8 @@ def load_checkpoint(path: Path, task: str | None = None, device: torch.device | 
     tensors, _ = read_safetensors(path, advice)
     normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
     windows = tensors.pop("demonstrations")
-    net = TemporalUnet(windows.shape[-1], card.network.width, card.network.multipliers)
+    with torch.random.fork_rng(devices=[]):
+        net = TemporalUnet(windows.shape[-1], card.network.width, card.network.multipliers)
     net.load_state_dict({name.removeprefix("net."): value for name, value in tensors.items()})
     return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path)
 

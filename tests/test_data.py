@@ -1,5 +1,6 @@
 """Normaliser, windows, demonstrations and datasets."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -196,6 +197,15 @@ def test_demonstrations_are_generated_once_then_reused_until_steps_or_seed_chang
     assert task.asked == 3
     assert digest(other) != digest(fewer)
     assert digest(load_dataset(UMAZE, "cdiff/maze2d-umaze-v0")) == digest(other)
+
+
+@pytest.mark.usefixtures("own_minari")
+def test_two_that_ask_for_demonstrations_at_once_share_one_generation():
+    task = Counting()
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda _: demonstrations(task, 200, 7), range(2))
+    assert task.asked == 1
+    assert digest(first) == digest(second)
 
 
 def test_altered_demonstrations_are_generated_anew(own_minari):

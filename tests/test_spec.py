@@ -217,6 +217,7 @@ MISTAKES = {
         '1 task: these are constraints of "maze2d-large", the task here is "maze2d-umaze"',
     ),
     "all coefficients 0": (item("kind: linear", "a: {x: 0.0}", "b: 1.0"), "4 constraints[1]: all coefficients are 0"),
+    "no constraint": ("task: maze2d-umaze\nconstraints: []\n", "2 constraints: "),
     "no coefficient": (item("kind: linear", "a: {}", "b: 1.0"), "5 constraints[1].a: "),
     "centre and P": (
         item(*DISC, "radius: 1.0", "P: {x: {x: 1.0}}", "r: 1.0"),

@@ -110,6 +110,11 @@ def test_the_shortest_route_round_the_u_is_known():
     assert UMAZE.path_length(UMAZE.centre((3, 1)), UMAZE.centre((1, 1))) == pytest.approx(6.0)
 
 
+def test_a_route_into_a_wall_is_refused():
+    with pytest.raises(CdiffError, match=r"no route in maze2d-umaze: the point \(-2, 0\) lies in a wall"):
+        UMAZE.route(UMAZE.centre((3, 1)), np.array([-2.0, 0.0]))
+
+
 def test_a_route_takes_the_cheaper_way_round():
     start, goal = LARGE.centre((1, 1)), LARGE.centre((3, 4))
     short = LARGE.route(start, goal)

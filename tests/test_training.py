@@ -44,13 +44,13 @@ def own_minari(tmp_path_factory):
         yield
 
 
-def recipe(spec: TrainSpec = TINY) -> Recipe:
-    changes = {"horizon": 32, "n_steps": 16, "demonstrations": DemonstrationSpec(steps=4000), "train": {"tiny": spec}}
+def recipe(spec: TrainSpec = TINY, horizon: int = 32, n_steps: int = 16) -> Recipe:
+    changes = {"horizon": horizon, "n_steps": n_steps, "demonstrations": DemonstrationSpec(steps=4000), "train": {"tiny": spec}}
     return load_recipe("maze2d-umaze").model_copy(update=changes)
 
 
-def fit(work: Path, spec: TrainSpec = TINY, seed: int = 0, **more) -> Checkpoint:
-    return train(UMAZE, recipe(spec), "tiny", seed=seed, device=CPU, work=work, **more)
+def fit(work: Path, spec: TrainSpec = TINY, seed: int = 0, horizon: int = 32, n_steps: int = 16, **more) -> Checkpoint:
+    return train(UMAZE, recipe(spec, horizon, n_steps), "tiny", seed=seed, device=CPU, work=work, **more)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,12 @@ def test_state_is_saved_every_so_many_steps(tmp_path):
     assert saved == [(step, step > 3) for step in range(1, 9)]
 
 
-REFUSED = {"seed": {"seed": 1}, "spec": {"spec": TINY.model_copy(update={"steps": 9})}}
+REFUSED = {
+    "seed": {"seed": 1},
+    "horizon": {"horizon": 64},
+    "n_steps": {"n_steps": 8},
+    "spec": {"spec": TINY.model_copy(update={"steps": 9})},
+}
 
 
 @pytest.mark.parametrize("field", REFUSED)
@@ -329,3 +334,30 @@ def test_the_commit_is_none_without_git(monkeypatch):
 
     monkeypatch.setattr(cdiff_cli.training, "subprocess", SimpleNamespace(run=missing, CalledProcessError=OSError))
     assert cdiff_cli.training.git_commit() == "none"
+
+
+def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
+    torch.manual_seed(3)
+    expected = torch.rand(2)
+    torch.manual_seed(3)
+    load_checkpoint(whole.path)
+    assert torch.equal(torch.rand(2), expected)
+
+
+# recipes --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("network", "complaint"),
+    [
+        ("{width: 20}", "multiple of 8"),
+        ("{multipliers: []}", "at least 1 item"),
+        ("{multipliers: [1, 2, 2, 2, 2, 2, 2, 2, 2]}", "halves the horizon 8 times, which 128 does not allow"),
+    ],
+)
+def test_a_network_that_cannot_be_built_is_refused_by_its_recipe(network, complaint, tmp_path):
+    text = (MODELS / "maze2d-umaze" / "recipe.yaml").read_text()
+    path = tmp_path / "recipe.yaml"
+    path.write_text(text.replace("{width: 32, multipliers: [1, 2, 4]}", network))
+    with pytest.raises(CdiffError, match=complaint):
+        load(path, Recipe)

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdiff_cli.errors import CdiffError
+
 Array = NDArray[np.float64]
 Cell = tuple[int, int]
 
@@ -118,6 +120,9 @@ class Maze2D:
         """Cells of a cheapest path (Dijkstra over free cells), both ends included."""
         source, target = self.cell(start), self.cell(goal)
         free = set(self.cells(" "))
+        for point, cell in ((start, source), (goal, target)):
+            if cell not in free:
+                raise CdiffError(f"no route in {self.name}: the point ({point[0]:g}, {point[1]:g}) lies in a wall")
         done: dict[Cell, Cell | None] = {}
         queue: list[tuple[float, Cell, Cell | None]] = [(0.0, source, None)]
         while queue:
