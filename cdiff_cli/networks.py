@@ -15,11 +15,17 @@ class TemporalUnet(nn.Module):
     Diffuser's architecture (Janner et al., 2022): residual blocks of two kernel-5 convolutions, the diffusion step added
     between them, stride-2 down- and upsampling between levels, skip connections. Two additions, for plans that do not jump
     at their pinned ends: every waypoint sees the pinned states as further channels, and within `ramp` waypoints of an end
-    the output is blended into the pinned state.
+    the output is blended into the pinned state. Two more, off by default, for planners that learn within the hour:
+
+    patch    waypoints a token. Above 1 the U-Net works on horizon / patch tokens and its output is a uniform cubic B-spline
+             with one knot a token: fewer tokens to convolve, and no jitter left to unlearn
+    octaves  Fourier features sin, cos(2^k pi z), k < octaves, of the pinned states, and of an estimate of the clean
+             trajectory made at each level on the way up and fed back there: walls are sharp functions of the position, which
+             convolutions of z alone learn slowly
 
     dim         number of coordinates of a waypoint
     width       channels of the first level
-    multipliers channels of each level, in units of width; the horizon must divide by 2^(levels - 1)
+    multipliers channels of each level, in units of width; the horizon must divide by patch * 2^(levels - 1)
     ends        the pinned waypoints: 0 the first, -1 the last
     ramp        length of the blend, waypoints
     """
@@ -29,24 +35,28 @@ class TemporalUnet(nn.Module):
         dim: int,
         width: int = 32,
         multipliers: tuple[int, ...] = (1, 2, 4),
+        *,
+        patch: int = 1,
+        octaves: int = 0,
         ends: tuple[int, ...] = (0, -1),
         ramp: int = 16,
     ) -> None:
         nn.Module.__init__(self)
-        self.ends, self.ramp = ends, ramp
-        channels = [dim * (1 + len(ends)), *(width * m for m in multipliers)]
-        levels = list(pairwise(channels))
-        self.stride = 2 ** (len(levels) - 1)
+        self.ends, self.ramp, self.patch, self.octaves = ends, ramp, patch, octaves
+        channels = [width * m for m in multipliers]
+        seen = dim * (1 + len(ends) * (1 + 2 * octaves))
+        self.stride = patch * 2 ** (len(channels) - 1)
         self.embed = nn.Sequential(SinusoidalStep(width), nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width))
+        self.stem = nn.Conv1d(seen, width, 2 * patch, stride=patch, padding=patch // 2) if patch > 1 else nn.Identity()
         self.down = nn.ModuleList(
             nn.ModuleList(
                 (
                     ResidualBlock(c_in, c_out, width),
                     ResidualBlock(c_out, c_out, width),
-                    nn.Conv1d(c_out, c_out, 3, stride=2, padding=1) if i < len(levels) - 1 else nn.Identity(),
+                    nn.Conv1d(c_out, c_out, 3, stride=2, padding=1) if i < len(channels) - 1 else nn.Identity(),
                 )
             )
-            for i, (c_in, c_out) in enumerate(levels)
+            for i, (c_in, c_out) in enumerate(pairwise([width if patch > 1 else seen, *channels]))
         )
         top = channels[-1]
         self.middle = nn.ModuleList((ResidualBlock(top, top, width), ResidualBlock(top, top, width)))
@@ -58,30 +68,59 @@ class TemporalUnet(nn.Module):
                     nn.ConvTranspose1d(c_in, c_in, 4, stride=2, padding=1),
                 )
             )
-            for c_in, c_out in reversed(levels[1:])
+            for c_in, c_out in reversed(list(pairwise(channels)))
         )
-        self.head = nn.Sequential(ConvBlock(channels[1], channels[1]), nn.Conv1d(channels[1], dim, 1))
+        if octaves:
+            self.guess = nn.ModuleList(nn.Conv1d(c, dim, 1) for c in reversed(channels))
+            self.recall = nn.ModuleList(nn.Conv1d(dim * (1 + 2 * octaves), c, 1) for c in reversed(channels))
+            self.last = ResidualBlock(channels[0], channels[0], width)
+        self.head = nn.Sequential(ConvBlock(channels[0], channels[0]), nn.Conv1d(channels[0], dim, 1))
 
     def forward(self, x: Tensor, t: Tensor) -> Tensor:
         """The clean estimate [batch, horizon, dim] of the noisy trajectories x at the diffusion steps t [batch]."""
+        return self.estimates(x, t)[-1]
+
+    def estimates(self, x: Tensor, t: Tensor) -> list[Tensor]:
+        """Estimates of the clean trajectory, of rising resolution [batch, horizon / k, dim]: the last one is the output, the
+        others (none without octaves) estimate means over k waypoints and are trained along.
+        """
         pinned = [x[:, [end]] for end in self.ends]
-        h = torch.cat((x, *(state.expand_as(x) for state in pinned)), -1).transpose(1, 2)
+        features = [torch.cat((state, *self._fourier(state)), -1).expand(-1, x.shape[1], -1) for state in pinned]
+        h = self.stem(torch.cat((x, *features), -1).transpose(1, 2))
         step = self.embed(t)
-        skips = []
+        skips, guesses = [], []
+
+        def look(level: int, h: Tensor) -> Tensor:
+            """h, told where in the world the trajectory seems to be."""
+            if not self.octaves:
+                return h
+            guess = self.guess[level](h).float()
+            guesses.append(guess.transpose(1, 2))
+            place = guess.detach()
+            return h + cast(Tensor, self.recall[level](torch.cat((place, *self._fourier(place)), 1).to(h)))
+
         for first, second, shrink in cast(Any, self.down):
             h = second(first(h, step), step)
             skips.append(h)
             h = shrink(h)
         for block in self.middle:
             h = block(h, step)
-        for first, second, grow in cast(Any, self.up):
+        h = look(0, h)
+        for level, (first, second, grow) in enumerate(cast(Any, self.up), start=1):
             h = second(first(torch.cat((h, skips.pop()), 1), step), step)
-            h = grow(h)
-        estimate = self.head(h).transpose(1, 2).to(x)
+            h = look(level, grow(h))
+        if self.octaves:
+            h = self.last(h, step)
+        estimate = _spline(self.head(h).to(x), self.patch).transpose(1, 2)
         for end, state in zip(self.ends, pinned, strict=True):
             share = self._share(end, x)
             estimate = share * state + (1 - share) * estimate
-        return estimate
+        return [*guesses, estimate]
+
+    def _fourier(self, z: Tensor) -> list[Tensor]:
+        """Sines and cosines of z at each octave, every one of the shape of z."""
+        angles = [2**k * math.pi * z for k in range(self.octaves)]
+        return [f(angle) for angle in angles for f in (torch.sin, torch.cos)]
 
     def _share(self, end: int, x: Tensor) -> Tensor:
         """Share of the pinned state in the output [horizon, 1]: 1 at the end, falling to 0 within the ramp."""
@@ -89,6 +128,21 @@ class TemporalUnet(nn.Module):
         tau = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
         share = (1 - tau / max(ramp, 1)).clamp_min(0.0)[:, None]
         return share if end == 0 else share.flip(0)
+
+
+def _spline(knots: Tensor, patch: int) -> Tensor:
+    """The uniform cubic B-spline of the knots [batch, dim, n], sampled at `patch` points a knot [batch, dim, n * patch];
+    the end knots are repeated.
+    """
+    if patch == 1:
+        return knots
+    u = ((torch.arange(4 * patch, device=knots.device, dtype=knots.dtype) + 0.5) / patch - 2).abs()
+    weight = torch.where(u < 1, 2 / 3 - u**2 + u**3 / 2, (2 - u) ** 3 / 6)
+    dim, cut = knots.shape[1], 2 * patch + 3 * patch // 2
+    padded = F.pad(knots, (2, 2), mode="replicate")
+    with torch.autocast(knots.device.type, enabled=False):
+        curve = F.conv_transpose1d(padded, weight.expand(dim, 1, -1), stride=patch, groups=dim)
+    return curve[..., cut : cut + knots.shape[2] * patch]
 
 
 class SinusoidalStep(nn.Module):

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,10 +13,12 @@ Positive = Annotated[int, Field(gt=0)]
 
 
 class NetworkSpec(Strict):
-    """Size of the TemporalUnet."""
+    """Size of the TemporalUnet (networks.py); the defaults are Diffuser's architecture."""
 
     width: Annotated[int, Field(gt=0, multiple_of=8)] = 32  # the channels are normalised in 8 groups
     multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
+    patch: Literal[1, 2, 4, 8, 16] = 1
+    octaves: Annotated[int, Field(ge=0, le=10)] = 0
 
 
 class TrainSpec(Strict):
@@ -30,6 +32,7 @@ class TrainSpec(Strict):
     schedule: str = Field("cosine", pattern="^(cosine|constant)$")
     ema: Annotated[float, Field(ge=0, lt=1)] = 0.995
     smoothness: Annotated[float, Field(ge=0)] = 100.0
+    emphasis: Annotated[float, Field(ge=1)] = 5.0
     trips: Annotated[float, Field(ge=0, le=1)] = 0.5
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
@@ -76,11 +79,9 @@ class Recipe(Strict):
     @model_validator(mode="after")
     def _horizon_divides(self) -> "Recipe":
         for name, spec in self.train.items():
-            halvings = len(spec.network.multipliers) - 1
-            if self.horizon % 2**halvings:
-                raise ValueError(
-                    f"train.{name}: its network halves the horizon {halvings} times, which {self.horizon} does not allow"
-                )
+            stride = spec.network.patch * 2 ** (len(spec.network.multipliers) - 1)
+            if self.horizon % stride:
+                raise ValueError(f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride")
         return self
 
 

@@ -18,10 +18,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from cdiff_cli.data import Normaliser, Progress, Windows, demonstrations, digest, load_dataset
-from cdiff_cli.diffusion import Schedule, training_loss
+from cdiff_cli.diffusion import Schedule, Weighing, training_loss
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.networks import TemporalUnet
-from cdiff_cli.recipe import Card, Recipe, TrainSpec, home, shown
+from cdiff_cli.recipe import Card, NetworkSpec, Recipe, TrainSpec, home, shown
 from cdiff_cli.tasks import Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
@@ -134,10 +134,15 @@ def train(
         "data": data_statistics(task, episodes, recipe.horizon),
     }
     sample = windows[torch.linspace(0, len(windows.starts) - 1, SAMPLES).long()].double()
-    tensors = {f"net.{name}": value.cpu().contiguous() for name, value in fit.ema.state_dict().items()}
+    tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in fit.ema.state_dict().items()}
     tensors |= {"normaliser.centre": normaliser.centre, "normaliser.scale": normaliser.scale}
     tensors |= {"demonstrations": normaliser.decode(sample).float()}
     return save_checkpoint(work / "model.safetensors", tensors, card)
+
+
+def build(dim: int, network: NetworkSpec) -> TemporalUnet:
+    """A network of that size, its weights drawn from the global generator."""
+    return TemporalUnet(dim, **network.model_dump())
 
 
 def end_pins(horizon: int, dim: int) -> Tensor:
@@ -172,7 +177,7 @@ class _Fit:
     def start(cls, dim: int, recipe: Recipe, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # weight initialisation draws from the global generator; fork_rng restores it
-            net, ema = (TemporalUnet(dim, spec.network.width, spec.network.multipliers) for _ in range(2))
+            net, ema = (build(dim, spec.network) for _ in range(2))
         ema.load_state_dict(net.state_dict())
         net, ema = net.to(device), ema.to(device).requires_grad_(False)
         optimiser = torch.optim.Adam(net.parameters(), spec.learning_rate)
@@ -182,13 +187,14 @@ class _Fit:
     def advance(self, windows: Windows, schedule: Schedule, pinned: Tensor) -> float:
         """One optimiser step; returns the loss."""
         spec, loss_value, mse_value = self.spec, 0.0, 0.0
+        weighing = Weighing(spec.smoothness, spec.emphasis)
         for group in self.optimiser.param_groups:
             group["lr"] = spec.learning_rate * self._rate()
         self.optimiser.zero_grad()
         self.drawn_from = self.generator.get_state()
         for _ in range(spec.accumulate):
             x0 = windows.draw(spec.batch, self.generator).to(self.device)
-            loss, mse = training_loss(self.net, schedule, x0, pinned, spec.smoothness, self.generator, spec.bf16)
+            loss, mse = training_loss(self.net, schedule, x0, pinned, weighing, self.generator, spec.bf16)
             (loss / spec.accumulate).backward()  # type: ignore[no-untyped-call]
             loss_value, mse_value = loss_value + loss.item() / spec.accumulate, mse_value + mse.item() / spec.accumulate
         if not math.isfinite(loss_value):
@@ -351,8 +357,8 @@ def load_checkpoint(path: Path, task: str | None = None, device: torch.device | 
     normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
     windows = tensors.pop("demonstrations")
     with torch.random.fork_rng(devices=[]):
-        net = TemporalUnet(windows.shape[-1], card.network.width, card.network.multipliers)
-    net.load_state_dict({name.removeprefix("net."): value for name, value in tensors.items()})
+        net = build(windows.shape[-1], card.network)
+    net.load_state_dict({name.removeprefix("net."): value.float() for name, value in tensors.items()})
     return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from cdiff_cli.constraint import Constraint, Pins
-from cdiff_cli.diffusion import KERNELS, Noise, Schedule, ddim, ddpm, langevin, sample, training_loss
+from cdiff_cli.diffusion import KERNELS, Noise, Schedule, Weighing, ddim, ddpm, langevin, sample, training_loss
 from cdiff_cli.methods import AugmentedLagrangian, Projected, Unconstrained
 from tests.problems import F64, draws, gaussian_denoiser, generator, half_space, normal, pin, vec, waypoints
 
@@ -239,19 +239,19 @@ class _Constant(nn.Module):
         nn.Module.__init__(self)
         self.value = value
 
-    def forward(self, x, _):
-        return torch.full_like(x, self.value)
+    def estimates(self, x, _):
+        return [torch.full_like(x, self.value)]
 
 
 def test_training_loss_of_a_constant_error_is_its_square_without_pins():
     x0, none = torch.zeros(8, 5, 2), torch.zeros(5, 2, dtype=torch.bool)
-    loss, mse = training_loss(_Constant(3.0), Schedule.cosine(10), x0, none, 100.0, generator(0), False)
+    loss, mse = training_loss(_Constant(3.0), Schedule.cosine(10), x0, none, Weighing(100.0), generator(0), False)
     assert float(loss) == float(mse) == 9.0  # a constant error has no jitter
 
 
 def test_training_loss_counts_no_pinned_coordinate_and_weighs_jitter():
     x0, pinned = torch.zeros(8, 4, 1), torch.zeros(4, 1, dtype=torch.bool)
     pinned[0] = True
-    loss, mse = training_loss(_Constant(1.0), Schedule.cosine(10), x0, pinned, 10.0, generator(0), False)
+    loss, mse = training_loss(_Constant(1.0), Schedule.cosine(10), x0, pinned, Weighing(10.0), generator(0), False)
     assert float(mse) == pytest.approx(0.75)  # error (0, 1, 1, 1)
     assert float(loss) == pytest.approx(0.75 + 10 / 3, rel=1e-6)  # one jump among three, float32

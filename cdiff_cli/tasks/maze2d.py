@@ -212,7 +212,7 @@ class Maze2D:
             yield np.clip((wanted - v) * 0.6 + drift * min(1.0, distance / 0.3), -1.0, 1.0)
 
 
-UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"), (0.1, 0.4))
+UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"), (0.05, 0.25))
 LARGE = Maze2D(
     "maze2d-large",
     "PointMaze_Large-v3",
