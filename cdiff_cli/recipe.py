@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -51,9 +51,11 @@ class PaperUnits(Strict):
 
 
 class Preset(Strict):
-    """How to sample: the kernel, frozen extra steps, the final polish, and each method's constants by its name."""
+    """How to sample: the kernel, the network calls to respace the schedule to (None: as trained), frozen extra steps, the
+    final polish, and each method's constants by its name."""
 
-    kernel: str = Field("ddpm", pattern="^(ddpm|ddim|langevin)$")
+    kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
+    steps: Positive | None = None
     extra_steps: Annotated[int, Field(ge=0)] = 0
     polish: bool = False
     methods: dict[str, dict[str, Any]] = {}
@@ -81,6 +83,13 @@ class Recipe(Strict):
                 raise ValueError(
                     f"train.{name}: its network halves the horizon {halvings} times, which {self.horizon} does not allow"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _presets_fit(self) -> "Recipe":
+        for name, preset in self.presets.items():
+            if preset.steps is not None and preset.steps > self.n_steps:
+                raise ValueError(f"presets.{name}.steps: expected 1 to {self.n_steps} (n_steps), found {preset.steps}")
         return self
 
 
