@@ -31,8 +31,11 @@ ConstraintFile = Annotated[Path | None, typer.Option("--constraints", help="YAML
 CheckpointFile = Annotated[Path | None, typer.Option("--checkpoint", help="a .safetensors checkpoint [default: the shipped one]")]
 Start = Annotated[str | None, typer.Option("--start", help="start position, metres, as 0.3,-1.2 [default: the paper's]")]
 Goal = Annotated[str | None, typer.Option("--goal", help="goal position, metres, as 0.1,0.9 [default: the paper's]")]
-Kernel = Annotated[str | None, typer.Option("--kernel", help="ddpm, ddim or langevin [default: the preset's]")]
-Steps = Annotated[int | None, typer.Option("--steps", help="diffusion steps, at most as trained; few go best with --kernel ddim")]
+Kernel = Annotated[str | None, typer.Option("--kernel", help="ddpm, ddim, dpm++2m or langevin [default: the preset's]")]
+Steps = Annotated[
+    int | None,
+    typer.Option("--steps", help="diffusion steps, at most as trained; few go best with --kernel dpm++2m [default: the preset's]"),
+]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="a method's constant, as rho=0.05; may be repeated")]
 Count = Annotated[int, typer.Option("--n", "--episodes", help="number of plans, one seed each")]
 Seed = Annotated[int, typer.Option("--seed", help="first seed; plans use seed, seed + 1, ...")]

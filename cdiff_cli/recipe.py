@@ -54,9 +54,11 @@ class PaperUnits(Strict):
 
 
 class Preset(Strict):
-    """How to sample: the kernel, frozen extra steps, the final polish, and each method's constants by its name."""
+    """How to sample: the kernel, the network calls to respace the schedule to (None: as trained), frozen extra steps, the
+    final polish, and each method's constants by its name."""
 
-    kernel: str = Field("ddpm", pattern="^(ddpm|ddim|langevin)$")
+    kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
+    steps: Positive | None = None
     extra_steps: Annotated[int, Field(ge=0)] = 0
     polish: bool = False
     methods: dict[str, dict[str, Any]] = {}
@@ -82,6 +84,13 @@ class Recipe(Strict):
             stride = spec.network.patch * 2 ** (len(spec.network.multipliers) - 1)
             if self.horizon % stride:
                 raise ValueError(f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride")
+        return self
+
+    @model_validator(mode="after")
+    def _presets_fit(self) -> "Recipe":
+        for name, preset in self.presets.items():
+            if preset.steps is not None and preset.steps > self.n_steps:
+                raise ValueError(f"presets.{name}.steps: expected 1 to {self.n_steps} (n_steps), found {preset.steps}")
         return self
 
 

@@ -132,10 +132,12 @@ def resolve(options: Options) -> Resolved:
         denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
-    if options.steps is not None:
-        if not 1 <= options.steps <= schedule.n_steps:
-            raise CdiffError(f"--steps: expected 1 to {schedule.n_steps} (as trained), found {options.steps}")
-        schedule = schedule.respaced(options.steps)
+    steps = preset.steps if options.steps is None else options.steps
+    if steps is not None:
+        if not 1 <= steps <= schedule.n_steps:
+            source = f'preset "{options.preset}", steps' if options.steps is None else "--steps"
+            raise CdiffError(f"{source}: expected 1 to {schedule.n_steps} (as trained), found {steps}")
+        schedule = schedule.respaced(steps)
     start = parse_state("--start", options.start, recipe.start, task)
     goal = parse_state("--goal", options.goal, recipe.goal, task)
     horizon = checkpoint.card.horizon if checkpoint else recipe.horizon

@@ -97,10 +97,12 @@ def test_every_method_and_preset_plans(method, preset, tmp_path):
     assert json.loads(result.stdout)["summary"][0]["violation"]["mean"] < 20
 
 
-def test_few_ddim_steps_make_few_calls(tmp_path):
-    result = cdiff("plan", "--kernel", "ddim", "--steps", 8, "--n", 1, "--json", "--runs", tmp_path)
+@pytest.mark.parametrize("kernel", ["ddim", "dpm++2m"])
+def test_few_steps_make_few_calls_and_still_obey(kernel, tmp_path):
+    result = cdiff("plan", "--kernel", kernel, "--steps", 8, "--n", 1, "--json", "--runs", tmp_path)
     summary = json.loads(result.stdout)["summary"][0]
     assert summary["calls"]["mean"] == 8
+    assert summary["violation"]["mean"] == 0
     assert summary["preset"] == "recommended*"
 
 
@@ -198,6 +200,7 @@ OPTIONS = {
     "start not numbers": (["--start", "a,b"], ["expected a number for x"]),
     "start too short": (["--start", "1"], ["--start: y missing"]),
     "no plans": (["--n", "0"], ["at least 1"]),
+    "unknown kernel": (["--kernel", "dpm+2m"], ['no kernel "dpm+2m"', 'did you mean "dpm++2m"']),
     "too many steps": (["--steps", "65"], ["expected 1 to 64"]),
     "missing checkpoint": (["--checkpoint", "none.safetensors"], ["no such checkpoint", "cdiff train"]),
     "unknown device": (["--device", "gpu9"], ['device "gpu9" cannot be used here']),
