@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.errors import InfeasibleError
+from cdiff_cli.levels import Level, segment_max
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -44,150 +44,6 @@ class Pins:
         return torch.where(self.mask, 0.0, direction)
 
 
-class Level(Protocol):
-    """A scalar function f of a state [..., dim], allowed where f <= 0, in environment units even after pull_back."""
-
-    def __call__(self, x: Tensor) -> Tensor: ...
-    def gradient(self, x: Tensor) -> Tensor:
-        """df/dx [..., dim]."""
-        ...
-
-    def size(self, x: Tensor) -> Tensor:
-        """|df/dx|^2 [...], plus |f| times the largest curvature, so that f / size is a safe step where the gradient fades."""
-        ...
-
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Level":
-        """f(centre + scale * z) as a function of z."""
-        ...
-
-    def shift(self, margin: float) -> "Level":
-        """A level allowed exactly where f <= -margin."""
-        ...
-
-    def segment_max(self, x0: Tensor, x1: Tensor) -> Tensor:
-        """The largest f on the straight segments from x0 to x1, exactly."""
-        ...
-
-
-@dataclass(frozen=True)
-class Affine:
-    """f(x) = a.x - b.   a [dim], b scalar, in the units of a.x"""
-
-    a: Tensor
-    b: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return x @ self.a - self.b
-
-    def gradient(self, x: Tensor) -> Tensor:
-        return self.a.expand_as(x)
-
-    def size(self, x: Tensor) -> Tensor:
-        return (self.a @ self.a).expand(x.shape[:-1])
-
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Affine":
-        return Affine(self.a * scale, self.b - self.a @ centre)
-
-    def shift(self, margin: float) -> "Affine":
-        return replace(self, b=self.b - margin)
-
-    def segment_max(self, x0: Tensor, x1: Tensor) -> Tensor:
-        return torch.maximum(self(x0), self(x1))
-
-
-@dataclass(frozen=True)
-class Quadric:
-    """f(x) = x.P x + q.x - r.   P [dim, dim] symmetric, q [dim], r scalar; any signature of P"""
-
-    P: Tensor
-    q: Tensor
-    r: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return ((x @ self.P) * x).sum(-1) + x @ self.q - self.r
-
-    def gradient(self, x: Tensor) -> Tensor:
-        return 2 * x @ self.P + self.q
-
-    def size(self, x: Tensor) -> Tensor:
-        return self.gradient(x).square().sum(-1) + 2 * torch.linalg.matrix_norm(self.P) * self(x).abs()
-
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Quadric":
-        P = scale[:, None] * self.P * scale
-        return Quadric(P, scale * (2 * self.P @ centre + self.q), -self(centre))
-
-    def shift(self, margin: float) -> "Quadric":
-        return replace(self, r=self.r - margin)
-
-    def segment_max(self, x0: Tensor, x1: Tensor) -> Tensor:
-        d = x1 - x0
-        curvature, slope = ((d @ self.P) * d).sum(-1), (self.gradient(x0) * d).sum(-1)
-        s = torch.where(curvature < 0, -slope / (2 * curvature), 0.0).clamp(0.0, 1.0)
-        inside = self(x0) + s * slope + s * s * curvature
-        return torch.maximum(inside, torch.maximum(self(x0), self(x1)))
-
-
-@dataclass(frozen=True)
-class Ellipsoid:
-    """f(x) = side * (m - m |(x - centre) / axes|): side +1 keeps outside, -1 keeps inside.
-
-    A ball has all axes equal to its radius m, and f is the signed distance in metres. For unequal semi-axes m is the
-    smallest one: |f| never exceeds the distance outside, nor the depth inside.
-
-    which   selects the coordinates it acts on      [k, dim], rows of the identity
-    centre, axes                                    [k]
-    m       value scale, environment units          scalar
-    """
-
-    which: Tensor
-    centre: Tensor
-    axes: Tensor
-    m: Tensor
-    side: int
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return self.side * self.m * (1 - self._scaled(x).norm(dim=-1))
-
-    def _scaled(self, x: Tensor) -> Tensor:
-        return (x @ self.which.T - self.centre) / self.axes
-
-    def gradient(self, x: Tensor) -> Tensor:
-        y = self._scaled(x)
-        unit = y / y.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-        return (-self.side * self.m * unit / self.axes) @ self.which
-
-    def size(self, x: Tensor) -> Tensor:
-        return self.gradient(x).square().sum(-1)
-
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Ellipsoid":
-        s = self.which @ scale
-        return replace(self, centre=(self.centre - self.which @ centre) / s, axes=self.axes / s)
-
-    def shift(self, margin: float) -> "Ellipsoid":
-        grown = 1 + self.side * margin / float(self.m)
-        if grown <= 0 and self.side < 0:
-            raise InfeasibleError(f"no point lies {margin:g} inside an ellipsoid of semi-axis {float(self.m):g}; relax one of them")
-        return replace(self, axes=self.axes * grown, m=self.m * grown)
-
-    def segment_max(self, x0: Tensor, x1: Tensor) -> Tensor:
-        if self.side < 0:
-            return torch.maximum(self(x0), self(x1))
-        y, d = self._scaled(x0), (x1 - x0) @ self.which.T / self.axes
-        s = (-(y * d).sum(-1) / (d * d).sum(-1).clamp_min(1e-30)).clamp(0.0, 1.0)
-        return self.m * (1 - (y + s[..., None] * d).norm(dim=-1))
-
-    @property
-    def is_ball(self) -> bool:
-        return bool(torch.allclose(self.axes, self.axes[0], rtol=1e-6))
-
-    def quadric(self) -> Quadric:
-        """The same set as a Quadric: side * (1 - |(x - centre) / axes|^2) <= 0."""
-        weight = self.which.T / self.axes**2
-        P = weight @ self.which
-        q = -2 * weight @ self.centre
-        return Quadric(-self.side * P, -self.side * q, self.side * ((self.centre / self.axes).square().sum() - 1))
-
-
 class Part(Protocol):
     """Some rows of a constraint."""
 
@@ -203,6 +59,10 @@ class Part(Protocol):
     def shift(self, margin: float) -> Self: ...
     def segment_max(self, x: Traj) -> Rows:
         """The largest unsafe value on the segments between waypoints [batch, horizon - 1]."""
+        ...
+
+    def on_segments(self) -> "tuple[Part, ...]":
+        """The parts that hold all along the segments, as far as the part's form allows; itself where they need no more."""
         ...
 
 
@@ -232,7 +92,49 @@ class Waypoints:
     def segment_max(self, x: Traj) -> Rows:
         if x.shape[1] < 2:
             return self(x)
-        return self.level.segment_max(x[:, :-1], x[:, 1:])
+        return segment_max(self.level, x[:, :-1], x[:, 1:])
+
+    def on_segments(self) -> "tuple[Waypoints | Segments, ...]":
+        return (self if self.level.convex else Segments(self.name, self.level),)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """f <= 0 all along the straight segments between waypoints: one row a segment, its largest f."""
+
+    name: str
+    level: Level
+
+    def labels(self, horizon: int) -> list[str]:
+        return [f"{self.name}@{tau}~{tau + 1}" for tau in range(horizon - 1)]
+
+    def __call__(self, x: Traj) -> Rows:
+        return self.segment_max(x)[:, : x.shape[1] - 1]
+
+    def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
+        s = self.level.worst(x[:, :-1], x[:, 1:])[..., None]
+        at = x[:, :-1] + s * (x[:, 1:] - x[:, :-1])
+        slope = self.level.gradient(at)
+
+        def pull(w: Rows) -> Traj:
+            out = torch.zeros_like(x)
+            out[:, :-1] += (1 - s) * w[..., None] * slope
+            out[:, 1:] += s * w[..., None] * slope
+            return out
+
+        return self.level(at), pull, 2 * ((1 - s) ** 2 + s**2)[..., 0] * self.level.size(at)
+
+    def map(self, change: Callable[[Level], Level]) -> "Segments":
+        return replace(self, level=change(self.level))
+
+    def shift(self, margin: float) -> "Segments":
+        return replace(self, level=self.level.shift(margin))
+
+    def segment_max(self, x: Traj) -> Rows:
+        return Waypoints(self.name, self.level).segment_max(x)
+
+    def on_segments(self) -> "tuple[Segments]":
+        return (self,)
 
 
 @dataclass(frozen=True)
@@ -271,9 +173,11 @@ class Chain:
 
     def segment_max(self, x: Traj) -> Rows:
         """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
-        if x.shape[1] < 2:
-            return self.level(x)
-        return self.level.segment_max(x[:, :-1], x[:, 1:])
+        return Waypoints(self.name, self.level).segment_max(x)
+
+    def on_segments(self) -> "tuple[Chain | Segments, ...]":
+        """The chain, and its barrier on the segments where the waypoints' safety does not give it."""
+        return (self,) if self.level.convex else (self, Segments(self.name, self.level))
 
 
 @dataclass(frozen=True)
@@ -314,6 +218,10 @@ class Opaque:
 
     def segment_max(self, x: Traj) -> Rows:
         return self(x)
+
+    def on_segments(self) -> "tuple[Opaque]":
+        """Nothing is known of it between the waypoints."""
+        return (self,)
 
 
 @dataclass(frozen=True)

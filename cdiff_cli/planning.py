@@ -25,7 +25,8 @@ MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above
 class Problem:
     """All that sampling needs, resolved.
 
-    g            environment units
+    g            as declared, at the waypoints: what is scored                       environment units
+    enforced     what sampling obeys: g, taken on the segments where that is asked   environment units
     start, goal  pinned states [dim], or one a plan [n, dim], or None
     """
 
@@ -35,6 +36,7 @@ class Problem:
     schedule: Schedule
     normaliser: Normaliser
     g: Constraint
+    enforced: Constraint
     start: Array | None
     goal: Array | None
     device: torch.device
@@ -107,7 +109,7 @@ def plan(
     device, dim = problem.device, len(problem.task.layout)
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
-    g = pull_back(problem.g, centre, scale).to(like)
+    g = pull_back(problem.enforced, centre, scale).to(like)
     pins = make_pins(problem, len(seeds))
     shape = (problem.horizon, dim)
     total = problem.schedule.n_steps + extra_steps
@@ -167,7 +169,7 @@ def plan(
 
 def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array]:
     """Project finished plans in float64 onto the constraints tightened by MARGIN; also the largest displacement [n]."""
-    g = pull_back(problem.g.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
+    g = pull_back(problem.enforced.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
     pins = make_pins(problem, len(z), torch.float64, torch.device("cpu"))
     out = project(g, z, pins)
     columns = [problem.task.layout.index(name) for name in problem.task.positions]

@@ -3,20 +3,26 @@
     P(z) = argmin |x - z|^2  s.t.  g(x) <= 0          (paper, the projection operator)
 
 half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
+segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression (min-max formula)
-several parts                                            Dykstra's algorithm over the exact forms
+several other parts                                      Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
 
 import warnings
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cdiff_cli.constraint import Affine, Chain, Constraint, Ellipsoid, Level, Part, Pins, Quadric, Rows, Traj, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
 from cdiff_cli.errors import InfeasibleError
+from cdiff_cli.levels import Affine, Ellipsoid, Level, Quadric
+from cdiff_cli.segments import nearest_in_planes, planes
 
+REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 
 
@@ -31,12 +37,34 @@ def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
     _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
     if not g.parts or z.numel() == 0:
         return z
+    if all(tangible(part) for part in g.parts) and any(isinstance(part, Segments) for part in g.parts):
+        x = _around(cast(Any, g.parts), z, pins)
+        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
+            return x
     whole = bool((pins.mask.all(1) == pins.mask.any(1)).all())  # the exact forms move all of a waypoint or nothing of it
     if whole and all(has_exact_form(part) for part in g.parts):
         x = exact(g.parts[0], z, pins) if len(g.parts) == 1 else _dykstra(g, z, pins, tolerance)
         if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
     return _sequential(g, z, pins, tolerance)
+
+
+def tangible(part: Part) -> bool:
+    """Whether planes tangent to the part's surface, a few a waypoint, make a convex part of its set (segments.py)."""
+    level = getattr(part, "level", None)
+    return (isinstance(part, Waypoints) and isinstance(level, Affine)) or (
+        isinstance(part, Segments) and isinstance(level, Ellipsoid) and level.side > 0
+    )
+
+
+def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
+    """Projection onto the half-spaces of tangent planes, chosen anew at each result: the set so described holds the last result,
+    so the distance to z can only fall.
+    """
+    x = z
+    for _ in range(REFINEMENTS):
+        x = nearest_in_planes(z, planes(parts, x, pins), pins)
+    return x
 
 
 def has_exact_form(part: Part) -> bool:
@@ -263,7 +291,7 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
     for part in g.parts:
         if isinstance(part, Waypoints):
             each.append(free)
-        elif isinstance(part, Chain):
+        elif isinstance(part, Chain | Segments):
             each.append(free[:-1] | free[1:])
         else:
             each.append(torch.ones(len(part.labels(x.shape[1])), dtype=torch.bool, device=x.device))

@@ -55,12 +55,14 @@ class PaperUnits(Strict):
 
 class Preset(Strict):
     """How to sample: the kernel, the network calls to respace the schedule to (None: as trained), frozen extra steps, the
-    final polish, and each method's constants by its name."""
+    final polish, where constraints hold that do not say so themselves, and each method's constants by its name.
+    """
 
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
     steps: Positive | None = None
     extra_steps: Annotated[int, Field(ge=0)] = 0
     polish: bool = False
+    safety: Literal["waypoints", "segments"] = "waypoints"
     methods: dict[str, dict[str, Any]] = {}
 
 

@@ -17,7 +17,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
-from cdiff_cli.spec import Kind, load_constraints
+from cdiff_cli.spec import Kind, enforced, load_constraints
 from cdiff_cli.tasks import load_task
 from cdiff_cli.training import Checkpoint, choose_device, load_checkpoint
 
@@ -86,6 +86,7 @@ class Resolved:
             "kernel": self.kernel,
             "extra_steps": self.preset.extra_steps,
             "polish": self.preset.polish,
+            "safety": self.preset.safety,
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -145,7 +146,7 @@ def resolve(options: Options) -> Resolved:
         if checkpoint is None or not hasattr(task, "random_point"):
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, start, goal, device)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, enforced(kinds, g, preset.safety), start, goal, device)
     check_feasible(problem)
     return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
 

@@ -13,14 +13,19 @@ import torch
 from pydantic import Field, create_model, model_validator
 
 from cdiff_cli.config import Document, Strict
-from cdiff_cli.constraint import Affine, Chain, Constraint, Ellipsoid, Level, Part, Quadric, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Part, Waypoints
 from cdiff_cli.errors import suggestion
+from cdiff_cli.levels import Affine, Ellipsoid, Level, Quadric
 
 Number = Annotated[float, Field(strict=True)]
 PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
 Coordinates = Annotated[dict[str, Number], Field(min_length=1)]
 Location = tuple[str | int, ...]
 Layout = Sequence[str]
+Safety = Annotated[
+    Literal["waypoints", "segments"] | None,
+    Field(description="where it must hold: at waypoints, or all along the straight segments between them; default: the preset's"),
+]
 
 
 class Linear(Strict):
@@ -28,6 +33,7 @@ class Linear(Strict):
 
     kind: Literal["linear"]
     name: str = ""
+    safety: Safety = None
     a: Annotated[Coordinates, Field(description="coefficient of each coordinate; coordinates left out count 0")]
     b: Annotated[Number, Field(description="bound, in the units of a.x")]
 
@@ -59,6 +65,7 @@ class Quadratic(Strict):
 
     kind: Literal["quadratic"]
     name: str = ""
+    safety: Safety = None
     side: Literal["outside", "inside"]
     centre: Coordinates | None = None
     radius: PositiveNumber | None = None
@@ -126,6 +133,7 @@ class Dcbf(Strict):
 
     kind: Literal["dcbf"]
     name: str = ""
+    safety: Safety = None
     alpha: Annotated[float, Field(strict=True, gt=0, le=1, description="share of h that a step may use up")]
     barrier: Annotated[Linear | Quadratic, Field(discriminator="kind")]
 
@@ -186,6 +194,13 @@ def load_constraints(path: Path, task: str, layout: Layout) -> tuple[list[Kind],
         seen.add(named.name)
         parts.append(named)
     return parts, Constraint(tuple(spec.compile(layout) for spec in parts))
+
+
+def enforced(kinds: Sequence[Kind], g: Constraint, safety: str) -> Constraint:
+    """What sampling obeys: the parts that are to hold on segments (by their own word, else the preset's) taken so."""
+    wanted = [getattr(kind, "safety", None) or safety for kind in kinds]
+    each = [part.on_segments() if want == "segments" else (part,) for part, want in zip(g.parts, wanted, strict=True)]
+    return Constraint(tuple(part for parts in each for part in parts))
 
 
 def json_schema() -> dict[str, Any]:

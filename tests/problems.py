@@ -6,8 +6,9 @@ import numpy as np
 import qpsolvers
 import torch
 
-from cdiff_cli.constraint import Affine, Chain, Constraint, Ellipsoid, Opaque, Pins, Quadric, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints
 from cdiff_cli.diffusion import Step
+from cdiff_cli.levels import Affine, Ellipsoid, Quadric
 
 LAYOUT = ("x", "y", "vx", "vy")
 F64 = torch.float64

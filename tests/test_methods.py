@@ -5,9 +5,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Affine, Pins
+from cdiff_cli.constraint import Pins
 from cdiff_cli.diffusion import Noise, Schedule, Step, sample
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.levels import Affine
 from cdiff_cli.methods import (
     METHODS,
     AugmentedLagrangian,

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Affine, Constraint, Waypoints, stack
+from cdiff_cli.constraint import Constraint, Waypoints, stack
+from cdiff_cli.levels import Affine
 from cdiff_cli.metrics import (
     acceleration,
     boundary_mass,

@@ -25,7 +25,7 @@ def test_a_plan_of_a_seed_does_not_depend_on_its_batch(umaze):
 
 
 def test_projection_on_the_clean_estimate_leaves_a_plan_that_already_obeys_unchanged(umaze):
-    loose = replace(umaze.problem, g=umaze.problem.g.tighten(-100.0))
+    loose = replace(umaze.problem, enforced=umaze.problem.g.tighten(-100.0))
     np.testing.assert_array_equal(plan(loose, Projected(), [0]).x, plan(loose, Unconstrained(), [0]).x)
 
 

@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Affine, Constraint, Ellipsoid, Pins, Quadric, stack
+from cdiff_cli.constraint import Constraint, Pins, stack
+from cdiff_cli.levels import Affine, Ellipsoid, Quadric
 from cdiff_cli.projection import nearest, nearest_chain, project
 from tests.problems import (
     F64,

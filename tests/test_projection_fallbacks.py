@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.constraint import Affine, Chain, Constraint, Opaque, Pins, Quadric, Waypoints, stack
+from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints, stack
 from cdiff_cli.errors import InfeasibleError
+from cdiff_cli.levels import Affine, Quadric
 from cdiff_cli.projection import project
 from tests.problems import (
     F64,

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 import cdiff_cli.spec
 from cdiff_cli.config import Strict
-from cdiff_cli.constraint import Affine, Waypoints
+from cdiff_cli.constraint import Waypoints
 from cdiff_cli.errors import SpecError
+from cdiff_cli.levels import Affine
 from cdiff_cli.spec import json_schema, load_constraints
 from cdiff_cli.tasks import TASKS, load_task
 

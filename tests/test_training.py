@@ -358,6 +358,6 @@ def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
 def test_a_network_that_cannot_be_built_is_refused_by_its_recipe(network, complaint, tmp_path):
     text = (MODELS / "maze2d-umaze" / "recipe.yaml").read_text()
     path = tmp_path / "recipe.yaml"
-    path.write_text(text.replace("{width: 32, multipliers: [1, 2, 4]}", network))
+    path.write_text(text.replace("{width: 48, multipliers: [1, 2, 4], patch: 4, octaves: 3}", network))
     with pytest.raises(CdiffError, match=complaint):
         load(path, Recipe)

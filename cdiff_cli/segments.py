@@ -1,0 +1,166 @@
+"""Trajectories whose straight segments stay outside balls and ellipsoids: convex inner approximations, and their exact projection.
+
+A segment misses a ball exactly when a plane tangent to the ball has both its ends on the outer side. With one tangent plane a
+segment chosen, the safe set becomes, waypoint by waypoint, an intersection of a few half-spaces: convex, separable, inside the
+true set. The planes are chosen so that a path which crosses a ball slides round it on the side on which it passes the centre,
+the normals turning evenly from where it enters to where it leaves: a push straight outwards from the centre would tear it.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from cdiff_cli.constraint import Pins, Segments, Traj, Waypoints
+from cdiff_cli.levels import Affine, Ellipsoid
+
+Planes = tuple[Tensor, Tensor]
+"""Half-spaces a.x <= b of each waypoint: a [batch, horizon, m, dim], b [batch, horizon, m]."""
+
+NEVER = 1e30  # bound of a half-space that is not there
+
+
+def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes:
+    """Half-spaces of each waypoint that together imply the parts: the affine ones themselves, for each ball the tangent planes of
+    the segment before and after.
+    """
+    each: list[tuple[Tensor, Tensor]] = []
+    for part in parts:
+        level = part.level
+        if isinstance(level, Affine):
+            each.append((level.a.expand_as(x), level.b.expand(x.shape[:2])))
+            continue
+        assert isinstance(level, Ellipsoid)
+        n = normals(level, x, pins)
+        a = -(n / level.axes) @ level.which
+        b = -1 - (n / level.axes) @ level.centre
+        zero, never = torch.zeros_like(a[:, :1]), torch.full_like(b[:, :1], NEVER)
+        each.append((torch.cat((zero, a), 1), torch.cat((never, b), 1)))  # of the segment before
+        each.append((torch.cat((a, zero), 1), torch.cat((b, never), 1)))  # of the segment after
+    return torch.stack([a for a, _ in each], 2), torch.stack([b for _, b in each], 2)
+
+
+def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
+    """Outward unit normals n of the tangent planes, one a segment, in the coordinates where the surface is the unit sphere
+    [batch, horizon - 1, k]: both ends y of the segment are to satisfy n.y >= 1.
+
+    Outside, n points to the segment's nearest point. Along a run of segments inside, from waypoint a to waypoint b, n turns
+    from the direction of a by way of that of the run's nearest point to that of b, in proportion to the path walked.
+    """
+    y = level.scaled(x)
+    first, last = y[:, :-1], y[:, 1:]
+    s = level.worst(x[:, :-1], x[:, 1:])[..., None]
+    near = first + s * (last - first)
+    distance = near.norm(dim=-1)
+    n = _unit(near, first)
+    inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-6)
+    if bool(inside.any()):
+        n = torch.where(inside[..., None], _turning(y, near, distance, inside), n)
+    return _tangent_to_pins(n, y, pins.mask[:, level.which.argmax(1)].all(1))
+
+
+def nearest_in_planes(z: Traj, halfspaces: Planes, pins: Pins) -> Traj:
+    """The nearest trajectory with a.x <= b at every waypoint, pinned waypoints left alone: exact with up to two active rows a
+    waypoint (always enough in the plane); where more are needed, the best point that two give.
+    """
+    a, b = halfspaces
+    value = (a * z[:, :, None]).sum(-1) - b
+    size = a.square().sum(-1)
+    wrong = (value.amax(2) > 0) & ~pins.mask.any(1)
+    if not bool(wrong.any()):
+        return z
+    out = z.clone()
+    out[wrong] = z[wrong] + _step(a[wrong], value[wrong], size[wrong])
+    return out
+
+
+def _step(a: Tensor, value: Tensor, size: Tensor) -> Tensor:
+    """The shortest d with value + a.d <= 0, among those that make one row or two rows equal: [n, m, dim] -> [n, dim]."""
+    m = a.shape[1]
+    i, j = torch.triu_indices(m, m, device=a.device)
+    gram = torch.einsum("nid,njd->nij", a, a)[:, i, j]
+    same = i == j
+    det = torch.where(same, size[:, i], size[:, i] * size[:, j] - gram**2)
+    floor = 1e-9 * (size[:, i] * size[:, j]).clamp_min(1e-30)
+    usable = torch.where(same, size[:, i] > 0, det > floor)
+    det = torch.where(usable, det, 1.0)
+    mu_i = torch.where(same, value[:, i], size[:, j] * value[:, i] - gram * value[:, j]) / det
+    mu_j = torch.where(same, 0.0, (size[:, i] * value[:, j] - gram * value[:, i]) / det)
+    d = -(mu_i[..., None] * a[:, i] + mu_j[..., None] * a[:, j])  # [n, pairs, dim]
+    excess = (value[:, None] + torch.einsum("npd,nid->npi", d, a)).clamp_min(0)
+    missed = torch.where(usable, excess.amax(-1), torch.inf)
+    tolerance = 1e-9 if a.dtype == torch.float64 else 1e-5
+    cost = torch.where(missed <= tolerance, d.square().sum(-1), 1e12 * (1 + missed))
+    return d[torch.arange(len(d), device=d.device), cost.argmin(1)]
+
+
+def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tensor:
+    """Normals along runs of segments inside the sphere, as normals() describes [batch, n, k]."""
+    n = inside.shape[1]
+    index = torch.arange(n, device=y.device).expand_as(inside)
+    start = torch.where(inside, -1, index).cummax(1).values + 1  # first segment of the run
+    stop = torch.where(inside, n, index).flip(1).cummin(1).values.flip(1) - 1  # its last
+    run = start.clamp_max(n - 1)
+    deepest = torch.full_like(distance, torch.inf).scatter_reduce(1, run, torch.where(inside, distance, torch.inf), "amin")
+    is_deepest = inside & (distance <= deepest.gather(1, run))
+    middle = torch.full_like(index, n).scatter_reduce(1, run, torch.where(is_deepest, index, n), "amin").gather(1, run)
+    stop, middle = stop.clamp_min(0), middle.clamp_max(n - 1)
+
+    def at(points: Tensor, which: Tensor) -> Tensor:
+        return points.gather(1, which[..., None].expand(-1, -1, points.shape[-1]))
+
+    into, out = at(y, run), at(y[:, 1:], stop)
+    across = out - into
+    e_in, e_out = _unit(into, across), _unit(out, across)
+    aside = near - (near * _unit(across, into)).sum(-1, keepdim=True) * _unit(across, into)
+    e_mid = _unit(at(near, middle), at(_sideways(aside, across), middle))
+    walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
+    half = (walked[:, :-1] + walked[:, 1:]) / 2  # at the middle of each segment
+    begin, end = half.gather(1, run), half.gather(1, stop)
+    share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
+    to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
+    angle = share * (to_mid + to_out)
+    return torch.where(angle <= to_mid, _turn(e_in, e_mid, angle), _turn(e_mid, e_out, angle - to_mid))
+
+
+def _turn(e: Tensor, towards: Tensor, angle: Tensor) -> Tensor:
+    """The unit vector at that angle from e on the great circle towards another."""
+    aside = towards - (towards * e).sum(-1, keepdim=True) * e
+    return angle.cos() * e + angle.sin() * _unit(aside, _sideways(torch.zeros_like(e), e))
+
+
+def _angle(a: Tensor, b: Tensor) -> Tensor:
+    return 2 * torch.atan2((a - b).norm(dim=-1, keepdim=True), (a + b).norm(dim=-1, keepdim=True))
+
+
+def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
+    """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
+    for ends, held in ((y[:, :-1], pinned[:-1]), (y[:, 1:], pinned[1:])):
+        length = ends.norm(dim=-1, keepdim=True)
+        e = ends / length.clamp_min(1e-12)
+        beyond = held[:, None] & ((n * ends).sum(-1, keepdim=True) < 1) & (length >= 1)
+        cosine = 1 / length.clamp_min(1.0)
+        aside = _unit(n - (n * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
+        n = torch.where(beyond, cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside, n)
+    return n
+
+
+def _unit(v: Tensor, instead: Tensor) -> Tensor:
+    """v / |v|, or the direction of another vector where v is nearly zero."""
+    length, other = v.norm(dim=-1, keepdim=True), instead.norm(dim=-1, keepdim=True)
+    first = torch.zeros_like(v)
+    first[..., 0] = 1.0
+    spare = torch.where(other > 1e-9, instead / other.clamp_min(1e-9), first)
+    return torch.where(length > 1e-9, v / length.clamp_min(1e-9), spare)
+
+
+def _sideways(v: Tensor, along: Tensor) -> Tensor:
+    """v, or where it is nearly zero some vector at right angles to `along`."""
+    if v.shape[-1] == 1:
+        return v
+    turned = torch.zeros_like(along)
+    turned[..., 0], turned[..., 1] = -along[..., 1], along[..., 0]
+    flat = turned.norm(dim=-1, keepdim=True) < 1e-9  # along has neither: any first axis will do
+    first = torch.zeros_like(along)
+    first[..., 0] = 1.0
+    return torch.where(v.norm(dim=-1, keepdim=True) > 1e-9, v, torch.where(flat, first, turned))
