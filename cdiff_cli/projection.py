@@ -4,7 +4,7 @@
 
 half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
-control-barrier chain over a half-space or a ball        weighted isotonic regression (min-max formula)
+control-barrier chain over a half-space or a ball        weighted isotonic regression (pooled adjacent violators)
 several other parts                                      Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
@@ -184,32 +184,77 @@ def _project_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
 def nearest_chain(h: Rows, gamma: float, weight: Tensor, fixed: Tensor) -> Rows:
     """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k where fixed.
 
-    In y_k = v_k / gamma^k this is isotonic regression, solved by its min-max formula with powers counted from each block's
-    first index, so that none underflows; the fixed ends bound it, and a bounded isotonic regression is the clipped one.
+    In y_k = v_k / gamma^k this is isotonic regression: pooled adjacent violators. The fixed ends bound it, and a bounded
+    isotonic regression is the clipped one. Computed in float64, returned in the dtype of h.
 
-    h [batch, n], weight [n], fixed [n] (only a first and a last run of indices may be fixed)
+    h [batch, n], weight [n] > 0, fixed [n] (only a first and a last run of indices may be fixed)
     """
     n = h.shape[1]
     free = torch.nonzero(~fixed)[:, 0]
     if len(free) == 0:
         return h
     first, last = int(free[0]), int(free[-1]) + 1
-    inner, w = h[:, first:last], weight[first:last]
-    m = last - first
-    index = torch.arange(m, device=h.device)
-    ahead = index[None, :] - index[:, None]
-    power = torch.where(ahead >= 0, gamma ** ahead.clamp_min(0).to(h.dtype), 0.0)  # gamma^(k - i), k >= i
-    value = (power * w * inner[:, None, :]).cumsum(-1) / (power * power * w).cumsum(-1).clamp_min(1e-300)
-    value = torch.where(ahead >= 0, value, torch.inf)
-    block = value.flip(-1).cummin(-1).values.flip(-1)  # min over j >= k of the block value that starts at i
-    reach = torch.where(ahead >= 0, power * torch.where(ahead >= 0, block, 0.0), -torch.inf)  # at k, from block start i
-    best = reach.max(1).values
+    best, _ = pool_violators(h[:, first:last].double(), gamma, weight[first:last].double())
+    if last - first == n:
+        return best.to(h)
+    power = _powers(gamma, last - first, best)[1:]
     if first > 0:
-        best = torch.maximum(best, gamma ** (index + 1).to(h.dtype) * h[:, first - 1 : first])
-    if last < n:
-        left = gamma ** (m - index).to(h.dtype)
-        best = torch.minimum(best, torch.where(left > 0, h[:, last : last + 1] / left.clamp_min(1e-300), torch.inf))
-    return torch.cat((h[:, :first], best, h[:, last:]), 1)
+        best = torch.maximum(best, power * h[:, first - 1 : first])
+    if last < n:  # powers are kept off 0: a last value of 0 bounds all by 0, and a bound must fit into the dtype of h
+        best = torch.minimum(best, h[:, last : last + 1] / power.flip(0).clamp_min(torch.finfo(h.dtype).tiny ** 0.5))
+    return torch.cat((h[:, :first], best.to(h), h[:, last:]), 1)
+
+
+def pool_violators(h: Rows, gamma: float, weight: Tensor) -> tuple[Rows, int]:
+    """The nearest chain to h by pooled adjacent violators, and the number of rounds it took.
+
+    A block of value v that starts at index s stands for v, gamma v, gamma^2 v, ...; the value nearest to its h is
+
+        v = N / D,   N = sum_k w_k gamma^(k - s) h_k,   D = sum_k w_k gamma^(2 (k - s))
+
+    and the next block violates if its value is < gamma^length v. A round merges every run of consecutive violators, of all
+    plans at once. Powers count from the first index of the merged block: they are at most 1, the first is 1, and one that
+    underflows belongs to a term that no longer counts.
+
+    Rounds (tests/benchmarks/chain.py): at gamma = 0.95 at most 17 for noise, random walks and smooth curves up to n = 1536; at
+    gamma = 0.999 and n = 384 noise takes 10, a walk 25, a smooth curve 47. The worst measured is a lone value far below the
+    end of a rise or far above its beginning, which takes in one neighbour a round: as many as n rounds, or about
+    log(distance) / log(1 / gamma) where that is fewer.
+
+    h [batch, n], weight [n] > 0
+    """
+    batch, n = h.shape
+    power = _powers(gamma, n, h)
+    powers = torch.stack((power, power.square()))
+    sums = h.new_full((2, batch, n + 1), torch.nan)  # N and D of all plans on one line; a NaN between two violates nothing
+    sums[0, :, :n], sums[1, :, :n] = weight * h, weight
+    sums = sums.flatten(1)
+    index = torch.arange(sums.shape[1] + 1, device=h.device)
+    start, value, rounds = index, sums[0] / sums[1], 0  # start: of each block, then the end of the line
+    due = gamma * value  # what the next block has to reach
+    while True:
+        leads = torch.ones_like(start, dtype=torch.bool)  # the blocks that stay, then the end of the line
+        torch.logical_not(value[1:] < due[:-1], out=leads[1:-1])
+        lead = leads.nonzero()[:, 0]
+        if len(lead) == len(start):
+            break
+        rounds += 1
+        into = leads[:-1].cumsum(0) - 1
+        merged = start.index_select(0, lead)
+        scale = powers.index_select(1, start[:-1] - merged.index_select(0, into))
+        sums = sums.new_zeros(2, len(lead) - 1).index_add_(1, into, scale * sums)
+        start, value = merged, sums[0] / sums[1]
+        due = power.index_select(0, start[1:] - start[:-1]) * value
+    if rounds == 0:
+        return h, 0
+    block = torch.repeat_interleave(start[1:] - start[:-1])
+    v = value.index_select(0, block) * power.index_select(0, index[:-1] - start.index_select(0, block))
+    return v.view(batch, n + 1)[:, :n], rounds
+
+
+def _powers(gamma: float, n: int, like: Tensor) -> Tensor:
+    """gamma^0, ..., gamma^n."""
+    return gamma ** torch.arange(n + 1, device=like.device).to(like.dtype)
 
 
 # several at once, and anything else -----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from cdiff_cli.constraint import Constraint, Pins, stack
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
-from cdiff_cli.projection import nearest, nearest_chain, project
+from cdiff_cli.projection import nearest, project
 from tests.problems import (
     F64,
     KINDS,
@@ -240,17 +240,6 @@ def test_chain_between_two_pinned_ends_agrees_with_proxqp(seed, horizon, alpha):
     x = project(g, z, pins)
     assert torch.equal(x[:, [0, -1]], z[:, [0, -1]])
     torch.testing.assert_close(x, _qp(g, z, pins), atol=QP, rtol=0)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=seeds, n=st.integers(2, 20), gamma=st.floats(0.0, 0.999))
-def test_weighted_nearest_chain_agrees_with_proxqp(seed, n, gamma):
-    h, w = normal(seed, 1, n), normal(seed + 1, n).abs() + 0.2
-    v = nearest_chain(h, gamma, w, torch.zeros(n, dtype=torch.bool))[0]
-    A = gamma * np.eye(n)[:-1] - np.eye(n)[1:]
-    root = w.sqrt().numpy()
-    expected = qp_project(A / root, np.zeros(n - 1), root * h[0].numpy()) / root  # y = sqrt(w) v makes it a projection
-    np.testing.assert_allclose(v.numpy(), expected, atol=QP)
 
 
 def test_chain_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
