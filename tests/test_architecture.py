@@ -29,9 +29,11 @@ RANKS = {
     "training": 5,
     "figures": 5,
     "runs": 5,
+    "certificate": 5,
     "tables": 6,
     "request": 6,
     "explain": 6,
+    "verify": 6,
     "experiment": 7,
     "cli": 8,
 }
