@@ -151,19 +151,22 @@ def options(values: dict[str, Any]) -> Any:
 
 
 def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
-    """Print a run: its table on stdout, where it lies, its picture."""
+    """Print a run: its table on stdout, where it lies, its picture, what its certificate says."""
+    from cdiff_cli.certificate import summary
     from cdiff_cli.runs import compare
     from cdiff_cli.tables import render
 
     groups = compare([{k: float(v) if isinstance(v, int) and k != "seed" else v for k, v in row.items()} for row in finished.rows])
     if as_json:
-        typer.echo(json.dumps({"run": str(finished.path), "summary": json.loads(render(groups, table, "json"))}))
+        found = json.loads(render(groups, table, "json"))
+        typer.echo(json.dumps({"run": str(finished.path), "summary": found, "certificate": finished.counts}))
         return
     transposed(groups[0], table)
     for note in finished.notes:
         typer.echo(note)
-    typer.echo(f"run      {finished.path}")
-    typer.echo(f"picture  {finished.picture}")
+    typer.echo(f"run          {finished.path}")
+    typer.echo(f"picture      {finished.picture}")
+    typer.echo(f"certificate  {summary(finished.counts)}")
 
 
 def transposed(group: Any, names: tuple[str, ...]) -> None:
@@ -262,6 +265,31 @@ def rollout(
     with progress() as tick:
         finished = rollout_run(resolved, runs, tick, video)
     finish(finished, tuple(dict.fromkeys((*ROLLOUT_TABLE, *QUALITY_TABLE))), as_json)
+
+
+@app.command()
+@reported
+def verify(
+    places: Annotated[list[Path], typer.Argument(metavar="RUN", help="run directories, or folders of runs", show_default=False)],
+    waypoints: Annotated[bool, typer.Option("--waypoints", help="ask for safety at the waypoints only")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Recompute certificates from the saved plans, with no model. Exit code 0: every plan is safe at its waypoints and between
+    them, and certificate.json says so; 1: not so; 2: a run cannot be read.
+    """
+    from cdiff_cli.verify import table, verify_runs
+
+    with progress() as tick:
+        verified, errors = verify_runs(places, tick)
+    for line in (*(f"note: {note}" for run in verified for note in run.notes), *(f"error: {error}" for error in errors)):
+        typer.echo(line, err=True)
+    if as_json:
+        typer.echo(json.dumps({"runs": [run.report(waypoints) for run in verified], "errors": errors}))
+    elif verified:
+        out.print(table(verified, waypoints))
+        for run in verified:
+            typer.echo(run.verdict(waypoints))
+    raise typer.Exit(2 if errors else 0 if all(run.holds(waypoints) for run in verified) else 1)
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """A whole command: plan or roll out, measure, and leave a run directory behind."""
 
+import hashlib
 import json
 import platform
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli import figures, metrics
+from cdiff_cli.certificate import Saved, certificate
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.planning import Plans, Rollout, follow, plan
@@ -32,6 +34,7 @@ class Finished:
     path: Path
     rows: list[Row]
     picture: Path
+    counts: dict[str, int | None]
     notes: tuple[str, ...] = ()
 
 
@@ -42,10 +45,11 @@ def plan_run(resolved: Resolved, root: Path, tick: Tick) -> Finished:
     notes = []
     with new_run(root, _name("plan", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
+        counts = _write_certificate(run.path, resolved, plans.x)
         _plan_pictures(run.path, resolved, plans, free)
         if plans.chain is not None and resolved.problem.horizon == 1:
             notes.append(_chain_figure(run.path, resolved, plans))
-    return Finished(run.path, rows, run.path / "plan.png", tuple(notes))
+    return Finished(run.path, rows, run.path / "plan.png", counts, tuple(notes))
 
 
 def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None, hold: int = 100) -> Finished:
@@ -61,6 +65,7 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
     with new_run(root, _name("rollout", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
         _write_rollout(run.path, resolved, done)
+        counts = _write_certificate(run.path, resolved, plans.x, done.x)
         _plan_pictures(run.path, resolved, plans, free)
         title = f"{task.name}, {resolved.options.method}: executed over planned"
         figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
@@ -68,7 +73,7 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
             tick("video", 1, 1)
-    return Finished(run.path, rows, run.path / "rollout.png")
+    return Finished(run.path, rows, run.path / "rollout.png", counts)
 
 
 def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
@@ -135,14 +140,25 @@ def _write_plans(path: Path, resolved: Resolved, plans: Plans, free: Plans, rows
         trace, violation=plans.trace, violation_free=free.trace, axes=np.array(["call", "x_t or clean estimate", "plan"])
     )
     write_rows(path / "rows.csv", rows)
-    proof = metrics.certificate(resolved.problem.g, plans.x, resolved.seeds)
-    (path / "certificate.json").write_text(json.dumps(proof, indent=1))
 
 
 def _write_rollout(path: Path, resolved: Resolved, done: Rollout) -> None:
     layout = np.array(resolved.problem.task.layout)
     arrays: Any = asdict(done) | {"layout": layout, "seed": np.array(resolved.seeds)}
     np.savez_compressed(path / "rollout.npz", **arrays)
+
+
+def _write_certificate(path: Path, resolved: Resolved, planned: Array, executed: Array | None = None) -> dict[str, int | None]:
+    """certificate.json of the arrays already written; its counts."""
+
+    def saved(file: str, x: Array) -> Saved:
+        return Saved(x, resolved.seeds, hashlib.sha256((path / file).read_bytes()).hexdigest())
+
+    rollout = None if executed is None else saved("rollout.npz", executed)
+    constraints = resolved.config()["constraints"]
+    proof = certificate(resolved.problem.task, constraints, resolved.problem.g, saved("plan.npz", planned), rollout)
+    (path / "certificate.json").write_text(json.dumps(proof, indent=1, allow_nan=False))
+    return proof["counts"]
 
 
 def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) -> None:

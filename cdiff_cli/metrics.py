@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cdiff_cli.constraint import Constraint, Opaque
+from cdiff_cli.constraint import Constraint, Part
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -28,8 +28,17 @@ def worst_waypoint(g: Constraint, x: Array) -> Array:
 
 def worst_segment(g: Constraint, x: Array) -> Array:
     """Largest g on the straight segments between waypoints [n], exact for half-spaces, quadrics, balls and ellipsoids."""
-    each = [part.segment_max(torch.from_numpy(x)) for part in g.parts]
+    each = [between(part, torch.from_numpy(x)) for part in g.parts]
     return _largest(torch.cat(each, 1) if each else torch.empty(len(x), 0, dtype=torch.float64)).numpy()
+
+
+def between(part: Part, x: torch.Tensor) -> torch.Tensor:
+    """Largest value of one part on each segment; rounding never puts it below the values at the segment's two ends."""
+    largest, level = part.segment_max(x), getattr(part, "level", None)
+    if level is None or x.shape[1] < 2:
+        return largest
+    ends = level(x)
+    return torch.maximum(largest, torch.maximum(ends[:, :-1], ends[:, 1:]))
 
 
 def distance(x: Array, x_free: Array, columns: Sequence[int], power: float = 1.0) -> Array:
@@ -122,27 +131,6 @@ def rollout_metrics(
             "goal_distance": float(goal_distance[i]),
         }
         for i in range(len(x))
-    ]
-
-
-def certificate(g: Constraint, x: Array, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """For each plan and constraint the worst value at waypoints and along segments, where, and whether it is exact."""
-    xs = torch.from_numpy(x)
-    found = [(part, part(xs), part.segment_max(xs), part.labels(x.shape[1])) for part in g.parts]
-    return [
-        {
-            "seed": int(seed),
-            "constraint": part.name,
-            "worst_waypoint": float(rows[i].max()) if rows.shape[1] else None,
-            "at": labels[int(rows[i].argmax())] if rows.shape[1] else None,
-            "worst_segment": float(between[i].max()),
-            "segment": int(between[i].argmax()),
-            "segment_bound_exact": not isinstance(part, Opaque),
-            "safe_at_waypoints": bool((rows[i] <= 0).all()),
-            "safe_on_segments": bool((between[i] <= 0).all()),
-        }
-        for i, seed in enumerate(seeds)
-        for part, rows, between, labels in found
     ]
 
 

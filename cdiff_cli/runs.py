@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from cdiff_cli.config import Dumper
 from cdiff_cli.errors import CdiffError
 
 Row = dict[str, Any]
@@ -119,7 +120,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True))
+    path.write_text(yaml.dump(dict(content), Dumper=Dumper, sort_keys=False, allow_unicode=True))
 
 
 # the comparison -------------------------------------------------------------------------------------------------------

@@ -31,9 +31,11 @@ RANKS = {
     "training": 7,
     "figures": 7,
     "runs": 7,
+    "certificate": 7,
     "tables": 8,
     "request": 8,
     "explain": 8,
+    "verify": 8,
     "experiment": 9,
     "cli": 10,
 }

@@ -59,12 +59,14 @@ def test_recommended_alm_has_zero_violation_at_waypoints_in_float64(alm_run):
     assert [row["violation"] for row in read_rows(run / "rows.csv")] == [0.0, 0.0]
     with np.load(run / "plan.npz") as plan:
         assert (plan["x"][..., 0] - plan["x"][..., 1]).max() <= 1.82
-    assert all(entry["safe_at_waypoints"] for entry in json.loads((run / "certificate.json").read_text()))
 
 
 def test_a_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
-    run, _ = alm_run
-    assert all(entry["safe_on_segments"] for entry in json.loads((run / "certificate.json").read_text()))
+    run, stdout = alm_run
+    proof = json.loads((run / "certificate.json").read_text())
+    assert [entry["status"] for entry in proof["entries"]] == ["safe", "safe"]
+    assert proof["counts"] == {"plans": 2, "safe_at_waypoints": 2, "safe_on_segments": 2, "safe_executed": None}
+    assert "certificate  2 of 2 plans safe at the waypoints, 2 of 2 between them\n" in stdout
 
 
 def test_plans_begin_and_end_where_asked(alm_run):
@@ -123,6 +125,7 @@ def test_gaussian2d_draws_figure_1_and_its_boundary_mass(tmp_path):
 def test_rollout_executes_and_scores(tmp_path):
     result = cdiff("rollout", "--method", "projected", "--n", 1, "--video", "gif", "--runs", tmp_path)
     assert "executed violation" in result.stdout
+    assert "1 of 1 plans safe at the waypoints, 1 of 1 between them, 1 of 1 as executed" in result.stdout
     (run,) = tmp_path.iterdir()
     with np.load(run / "rollout.npz") as rollout:
         assert rollout["x"].shape == (1, 228, 4)
@@ -131,6 +134,30 @@ def test_rollout_executes_and_scores(tmp_path):
     row = read_rows(run / "rows.csv")[0]
     assert row["steps"] == 227
     assert row["success"] in (0.0, 1.0)
+    (entry,) = json.loads((run / "certificate.json").read_text())["entries"]
+    assert entry["executed"]["worst"] == row["executed_worst"]
+    assert "1 of 1 as executed" in cdiff("verify", run).stdout
+
+
+def test_verify_certifies_a_run_of_alm(alm_run):
+    run, _ = alm_run
+    stdout = cdiff("verify", run).stdout
+    assert "cut-corner" in stdout
+    assert "2 of 2" in stdout
+    assert f"certified      {run}: 2 of 2 plans safe at the waypoints, 2 of 2 between them" in stdout
+
+
+def test_verify_refuses_what_ignores_a_constraint_that_binds(tmp_path):
+    tight = ROOT / "constraints" / "maze2d-umaze-tight.yaml"
+    cdiff("plan", "--method", "diffuser", "--constraints", tight, "--n", 2, "--runs", tmp_path)
+    assert "NOT certified" in cdiff("verify", tmp_path, code=1).stdout
+
+
+@pytest.mark.parametrize("name", ["pillar", "speed"])
+def test_verify_certifies_a_disc_and_a_barrier(name, tmp_path):
+    file = ROOT / "constraints" / f"maze2d-umaze-{name}.yaml"
+    cdiff("plan", "--method", "alm", "--constraints", file, "--n", 1, "--runs", tmp_path)
+    assert "1 of 1 plans safe at the waypoints, 1 of 1 between them" in cdiff("verify", tmp_path).stdout
 
 
 def test_compare_groups_runs_and_shows_the_paper(alm_run):
@@ -251,7 +278,7 @@ def test_help_names_every_command_and_imports_no_torch():
         "print(CliRunner().invoke(app, ['--help']).output); assert 'torch' not in sys.modules"
     )
     shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    for command in ("train", "plan", "rollout", "compare", "check"):
+    for command in ("train", "plan", "rollout", "verify", "compare", "check"):
         assert command in shown
 
 
