@@ -94,6 +94,7 @@ def train(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from cdiff_cli import training
+    from cdiff_cli.checkpoint import install
     from cdiff_cli.recipe import load_recipe, shown
     from cdiff_cli.tasks import load_task
 
@@ -135,7 +136,7 @@ def train(
             typer.echo(f"interrupted; {work}/state.safetensors is kept: go on with --resume", err=True)
             raise typer.Exit(130) from None
     card = checkpoint.card
-    target = training.install(checkpoint)
+    target = install(checkpoint)
     out.print(f"{card.steps} steps in {card.wall_s / 60:.1f} min on {card.device}: mean squared error {card.mse:.5f}")
     out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {recipe}.previous.safetensors)", highlight=False)
 

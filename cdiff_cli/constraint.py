@@ -6,14 +6,14 @@ an exact form; gradients are written out, so that a method pays for a few vector
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.levels import Level, segment_max
+from cdiff_cli.levels import Level, moved, segment_max
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -55,7 +55,14 @@ class Part(Protocol):
         """g(x); w -> w^T dg/dx; and per row a bound of |dg/dx|^2 that counts the rows it shares coordinates with."""
         ...
 
-    def map(self, change: Callable[[Level], Level]) -> Self: ...
+    def pull_back(self, centre: Tensor, scale: Tensor) -> Self:
+        """The same part of z, x = centre + scale * z; the rows keep their values and units."""
+        ...
+
+    def to(self, like: Tensor) -> Self:
+        """The same part with its numbers in the dtype and on the device of `like`."""
+        ...
+
     def shift(self, margin: float) -> Self: ...
     def segment_max(self, x: Traj) -> Rows:
         """The largest unsafe value on the segments between waypoints [batch, horizon - 1]."""
@@ -83,8 +90,11 @@ class Waypoints:
         slope = self.level.gradient(x)
         return self.level(x), lambda w: w[..., None] * slope, self.level.size(x)
 
-    def map(self, change: Callable[[Level], Level]) -> "Waypoints":
-        return replace(self, level=change(self.level))
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Waypoints":
+        return replace(self, level=self.level.pull_back(centre, scale))
+
+    def to(self, like: Tensor) -> "Waypoints":
+        return replace(self, level=moved(self.level, like))
 
     def shift(self, margin: float) -> "Waypoints":
         return replace(self, level=self.level.shift(margin))
@@ -94,7 +104,7 @@ class Waypoints:
             return self(x)
         return segment_max(self.level, x[:, :-1], x[:, 1:])
 
-    def on_segments(self) -> "tuple[Waypoints | Segments, ...]":
+    def on_segments(self) -> "tuple[Part, ...]":
         return (self if self.level.convex else Segments(self.name, self.level),)
 
 
@@ -124,8 +134,11 @@ class Segments:
 
         return self.level(at), pull, 2 * ((1 - s) ** 2 + s**2)[..., 0] * self.level.size(at)
 
-    def map(self, change: Callable[[Level], Level]) -> "Segments":
-        return replace(self, level=change(self.level))
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Segments":
+        return replace(self, level=self.level.pull_back(centre, scale))
+
+    def to(self, like: Tensor) -> "Segments":
+        return replace(self, level=moved(self.level, like))
 
     def shift(self, margin: float) -> "Segments":
         return replace(self, level=self.level.shift(margin))
@@ -133,7 +146,7 @@ class Segments:
     def segment_max(self, x: Traj) -> Rows:
         return Waypoints(self.name, self.level).segment_max(x)
 
-    def on_segments(self) -> "tuple[Segments]":
+    def on_segments(self) -> "tuple[Part, ...]":
         return (self,)
 
 
@@ -164,8 +177,11 @@ class Chain:
         size = self.level.size(x)
         return self(x), pull, (1 + keep) ** 2 * torch.maximum(size[:, :-1], size[:, 1:])
 
-    def map(self, change: Callable[[Level], Level]) -> "Chain":
-        return replace(self, level=change(self.level))
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Chain":
+        return replace(self, level=self.level.pull_back(centre, scale))
+
+    def to(self, like: Tensor) -> "Chain":
+        return replace(self, level=moved(self.level, like))
 
     def shift(self, margin: float) -> "Chain":
         """g <= -margin is the same chain over h - margin / alpha."""
@@ -175,7 +191,7 @@ class Chain:
         """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
         return Waypoints(self.name, self.level).segment_max(x)
 
-    def on_segments(self) -> "tuple[Chain | Segments, ...]":
+    def on_segments(self) -> "tuple[Part, ...]":
         """The chain, and its barrier on the segments where the waypoints' safety does not give it."""
         return (self,) if self.level.convex else (self, Segments(self.name, self.level))
 
@@ -210,7 +226,11 @@ class Opaque:
         size = pull(torch.ones_like(rows)).square().sum((1, 2))
         return rows.detach(), pull, size[:, None].expand_as(rows)
 
-    def map(self, change: Callable[[Level], Level]) -> "Opaque":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Opaque":
+        fn = self.fn
+        return replace(self, fn=lambda z: fn(centre.to(z) + scale.to(z) * z))
+
+    def to(self, like: Tensor) -> "Opaque":
         return self
 
     def shift(self, margin: float) -> "Opaque":
@@ -219,7 +239,7 @@ class Opaque:
     def segment_max(self, x: Traj) -> Rows:
         return self(x)
 
-    def on_segments(self) -> "tuple[Opaque]":
+    def on_segments(self) -> "tuple[Part, ...]":
         """Nothing is known of it between the waypoints."""
         return (self,)
 
@@ -262,13 +282,7 @@ class Constraint:
 
     def to(self, like: Tensor) -> "Constraint":
         """The same constraint with its numbers in the dtype and on the device of `like`."""
-
-        def move(level: Level) -> Level:
-            tensors = {f.name: getattr(level, f.name) for f in fields(level)}  # type: ignore[arg-type]
-            moved = {name: value.to(like) for name, value in tensors.items() if isinstance(value, Tensor)}
-            return replace(level, **moved)  # type: ignore[type-var]
-
-        return Constraint(tuple(part.map(move) for part in self.parts))
+        return Constraint(tuple(part.to(like) for part in self.parts))
 
 
 def stack(constraints: Sequence[Constraint]) -> Constraint:
@@ -278,11 +292,4 @@ def stack(constraints: Sequence[Constraint]) -> Constraint:
 
 def pull_back(g: Constraint, centre: Tensor, scale: Tensor) -> Constraint:
     """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units."""
-
-    def change(part: Part) -> Part:
-        if isinstance(part, Opaque):
-            fn = part.fn
-            return replace(part, fn=lambda z: fn(centre.to(z) + scale.to(z) * z))
-        return part.map(lambda level: level.pull_back(centre, scale))
-
-    return Constraint(tuple(change(part) for part in g.parts))
+    return Constraint(tuple(part.pull_back(centre, scale) for part in g.parts))

@@ -167,6 +167,16 @@ def load_dataset(task: Task, source: str) -> list[Array]:
     return _minari_episodes(minari, source, task)[0]
 
 
+def load_inputs(source: str) -> list[Array]:
+    """The inputs of the episodes of a Minari dataset, each [steps, m]; none of an HDF5 file, whose inputs keep its own frame."""
+    if Path(source).suffix in (".hdf5", ".h5"):
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        dataset = _minari().load_dataset(source)
+        return [np.asarray(episode.actions, dtype=np.float64) for episode in dataset.iterate_episodes()]
+
+
 def digest(episodes: Sequence[Array]) -> str:
     """sha256 over the lengths and the float64 states of the episodes."""
     sha = hashlib.sha256(str([episode.shape for episode in episodes]).encode())

@@ -59,7 +59,7 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
         raise CdiffError(f"{task.name} has no environment to roll out in; plan it with `cdiff plan --task {task.name}`")
     plans, free = _plan_both(resolved, tick)
     n = len(plans.x)
-    done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n))
+    done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n), plans.u)
     measured = metrics.rollout_metrics(resolved.problem.g, done.x, done.reward, done.success, done.goal_distance)
     rows = [row | more for row, more in zip(_plan_rows(resolved, plans, free), measured, strict=True)]
     with new_run(root, _name("rollout", resolved)) as run:
@@ -134,7 +134,8 @@ def _write_plans(path: Path, resolved: Resolved, plans: Plans, free: Plans, rows
         | resolved.config(),
     )
     layout = np.array(resolved.problem.task.layout)
-    np.savez_compressed(path / "plan.npz", x=plans.x, x_free=free.x, layout=layout, seed=np.array(resolved.seeds))
+    inputs: dict[str, Any] = {} if plans.u is None else {"u": plans.u}
+    np.savez_compressed(path / "plan.npz", x=plans.x, x_free=free.x, layout=layout, seed=np.array(resolved.seeds), **inputs)
     trace = path / "trace.npz"
     np.savez_compressed(
         trace, violation=plans.trace, violation_free=free.trace, axes=np.array(["call", "x_t or clean estimate", "plan"])

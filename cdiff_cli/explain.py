@@ -7,12 +7,12 @@ from rich.console import Console
 from rich.table import Table
 
 from cdiff_cli import figures
+from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
 from cdiff_cli.projection import has_exact_form
 from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.spec import load_constraints
 from cdiff_cli.tasks import load_task
-from cdiff_cli.training import load_checkpoint
 
 
 def explain(file: Path, picture: Path, out: Console) -> None:
@@ -24,9 +24,10 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     if not isinstance(name, str):
         raise document.error((), "the file must begin with `task: NAME` and a list `constraints:`")
     task, recipe = load_task(name), load_recipe(name)
-    kinds, g = load_constraints(file, name, task.layout)
     shipped = home() / "models" / name / "small.safetensors"
-    demonstrations = load_checkpoint(shipped, name).demonstrations.double() if shipped.exists() else None
+    checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
+    kinds, g = load_constraints(file, name, task.layout, checkpoint.dynamics if checkpoint else None)
+    demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
     for heading in ("name", "kind", "meaning", "rows", "coordinates", "projection", "demonstrations that obey"):

@@ -2,7 +2,7 @@
 segment where they are largest.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Protocol
 
 import torch
@@ -174,3 +174,9 @@ def segment_max(level: Level, x0: Tensor, x1: Tensor) -> Tensor:
     s = level.worst(x0, x1)[..., None]
     at_ends = torch.maximum(level(x0), level(x1))  # so that rounding never hides an unsafe end
     return torch.maximum(at_ends, level(x0 + s * (x1 - x0)))
+
+
+def moved(level: Level, like: Tensor) -> Level:
+    """The level with its numbers in the dtype and on the device of `like`."""
+    tensors = {f.name: value for f in fields(level) if isinstance(value := getattr(level, f.name), Tensor)}  # type: ignore[arg-type]
+    return replace(level, **{name: value.to(like) for name, value in tensors.items()})  # type: ignore[type-var]

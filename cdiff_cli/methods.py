@@ -16,8 +16,9 @@ from torch.nn import functional as F
 
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
+from cdiff_cli.dynamics import Warm, dynamics_of
 from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.projection import project
+from cdiff_cli.projection import project_from
 
 On = Literal["noisy", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
@@ -38,17 +39,22 @@ class Unconstrained:
 
 @dataclass(frozen=True)
 class Projected:
-    """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean."""
+    """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean.
+
+    rounds   of ADMM a step where dynamics are to be obeyed, from where the step before ended; other projections are exact
+    """
 
     on: On = "clean"
+    rounds: int = 30
 
-    def init(self, x: Traj, g: Constraint) -> None:
+    def init(self, x: Traj, g: Constraint) -> Warm | None:
         return None
 
-    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+    def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
         if self.on == "clean":
-            return step.reverse(project(g, step.x0, step.pins)), state
-        return project(g, step.reverse(step.x0), step.pins), state
+            x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
+            return step.reverse(x0), state
+        return project_from(g, step.reverse(step.x0), step.pins, state, self.rounds)
 
 
 @dataclass(frozen=True)
@@ -89,10 +95,11 @@ class PrimalDual:
 
 
 class AlmState(NamedTuple):
-    """Multipliers [batch or 1, n] and the penalty weight."""
+    """Multipliers [batch or 1, n] and the penalty weight; where dynamics are obeyed, those of ADMM."""
 
     lam: Rows
     rho: float
+    warm: Warm | None = None
 
 
 @dataclass(frozen=True)
@@ -105,8 +112,12 @@ class AugmentedLagrangian:
             x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
     lam_{t-1} = m,  rho_{t-1} = c rho_t
 
+    With dynamics among the constraints, `clean` is ADMM, the augmented Lagrangian of the split problem (dynamics.py): `rounds`
+    rounds a step, its multipliers carried from step to step.
+
     rho          first penalty weight; on clean in units of the exact one, kept at most 1, where one half-space is met at once
     c            its growth a step
+    rounds       of ADMM a step, with dynamics
     inner        rounds a step on clean: 1 is exact where each row moves its own waypoint, coupled rows need more
     coefficient, expectation, positive   as in PrimalDual
     """
@@ -115,6 +126,7 @@ class AugmentedLagrangian:
     rho: float = 0.5
     c: float = 1.02
     inner: int = 1
+    rounds: int = 10
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
@@ -123,12 +135,15 @@ class AugmentedLagrangian:
         return AlmState(zeros(x, g, self.expectation), self.rho)
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
-        lam, rho = state
+        lam, rho, _ = state
         if self.on == "noisy":
             rows, pull, _ = linearise(g, step.x, self.positive)
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
+        if dynamics_of(g):
+            x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
+            return step.reverse(x0), AlmState(lam, rho, warm)
         rows, pull, _ = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         for _ in range(self.inner):

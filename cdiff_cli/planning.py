@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from cdiff_cli.constraint import Constraint, Pins, Traj, pull_back
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step, sample
+from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
-from cdiff_cli.projection import project
+from cdiff_cli.projection import POLISH_ROUNDS, project_from
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
 MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
+CLEARANCE = 5e-3  # the same where dynamics are obeyed: ADMM ends near the set, and the execution near the plan
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Plans:
     trace          total violation a plan by network call: of x_t, of its clean estimate   [calls, 2, n]
     chain          every x_t, kept where small   [calls + 1, n, horizon, dim] or None
     polish         largest displacement by the final polish, environment units   [n]
+    u              inputs that produce x, where dynamics were obeyed   [n, horizon - 1, m] or None
     calls          network calls a plan
     total_s, network_s   wall time of the batch, and the network's part of it
     """
@@ -61,6 +64,7 @@ class Plans:
     calls: int
     total_s: float
     network_s: float
+    u: Array | None = None
 
 
 def network_denoiser(net: torch.nn.Module) -> Denoiser:
@@ -149,9 +153,9 @@ def plan(
                 "lower eta, rho or c with --set, or use --preset recommended"
             )
         z64 = z.double().cpu()
-        moved = np.zeros(len(seeds))
+        moved, u = np.zeros(len(seeds)), None
         if polish and not isinstance(method, Unconstrained):
-            z64, moved = polish_plans(problem, z64)
+            z64, moved, u = polish_plans(problem, z64)
         x = problem.normaliser.decode(z64).numpy()
     synchronise(device)
     total_s = time.perf_counter() - began - watching_s
@@ -164,17 +168,32 @@ def plan(
         calls=total,
         total_s=total_s,
         network_s=network_s,
+        u=u,
     )
 
 
-def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array]:
-    """Project finished plans in float64 onto the constraints tightened by MARGIN; also the largest displacement [n]."""
-    g = pull_back(problem.enforced.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
+def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
+    """Project finished plans in float64 onto the constraints tightened a little; also the largest displacement [n] and, where
+    dynamics were to be obeyed, the inputs: the plan is then what they produce, to the last bit.
+    """
+    reachable = next(iter(dynamics_of(problem.enforced)), None)
+    g = problem.enforced.tighten(MARGIN) if reachable is None else _tighten_others(problem.enforced, CLEARANCE)
+    g = pull_back(g, problem.normaliser.centre, problem.normaliser.scale)
     pins = make_pins(problem, len(z), torch.float64, torch.device("cpu"))
-    out = project(g, z, pins)
+    out, warm = project_from(g, z, pins, None, POLISH_ROUNDS)
+    inputs = None
+    if reachable is not None and warm is not None:
+        u = torch.clamp(warm.u, reachable.dynamics.low, reachable.dynamics.high)
+        out = problem.normaliser.encode(reachable.dynamics.rollout(problem.normaliser.decode(out[:, 0]), u))
+        inputs = u.numpy()
     columns = [problem.task.layout.index(name) for name in problem.task.positions]
     shift = (problem.normaliser.scale * (out - z))[..., columns].norm(dim=-1).amax(1)
-    return out, shift.numpy()
+    return out, shift.numpy(), inputs
+
+
+def _tighten_others(g: Constraint, margin: float) -> Constraint:
+    """g with all but the dynamics tightened."""
+    return Constraint(tuple(part if isinstance(part, Reachable) else part.shift(margin) for part in g.parts))
 
 
 def make_pins(problem: Problem, n: int, dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Pins:
@@ -213,15 +232,29 @@ class Rollout:
     goal_distance: Array
 
 
-def follow(task: Any, plans: Array, seeds: Sequence[int], hold: int = 100, on_step: Callable[[int], None] | None = None) -> Rollout:
-    """Follow each plan in the task's environment with its tracking controller, then hold at the last waypoint."""
+def follow(
+    task: Any,
+    plans: Array,
+    seeds: Sequence[int],
+    hold: int = 100,
+    on_step: Callable[[int], None] | None = None,
+    planned: Array | None = None,
+) -> Rollout:
+    """Follow each plan in the task's environment with its tracking controller, then hold at the last waypoint.
+
+    planned   inputs that belong to the plans [n, horizon - 1, m]: fed forward, the controller corrects what they miss
+    """
     env = task.make_env().unwrapped
     episodes: list[Mapping[str, Array]] = []
     for number, (x, seed) in enumerate(zip(plans, seeds, strict=True)):
         obs = task.reset_to(env, x[0], x[-1], seed)
         states, actions, rewards = [task.observe(obs)], [], []
         for tau in range(len(x) - 1 + hold):
-            u = task.track(states[-1], x[min(tau + 1, len(x) - 1)])
+            if planned is not None and tau < len(x) - 1:
+                low, high = env.action_space.low, env.action_space.high
+                u = np.clip(planned[number, tau] + task.track(states[-1], x[tau]), low, high).astype(np.float32)
+            else:
+                u = task.track(states[-1], x[min(tau + 1, len(x) - 1)])
             obs, reward, *_ = env.step(u)
             states.append(task.observe(obs))
             actions.append(u)

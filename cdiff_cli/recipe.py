@@ -54,8 +54,13 @@ class PaperUnits(Strict):
 
 
 class Preset(Strict):
-    """How to sample: the kernel, the network calls to respace the schedule to (None: as trained), frozen extra steps, the
-    final polish, where constraints hold that do not say so themselves, and each method's constants by its name.
+    """How to sample.
+
+    steps       network calls to respace the schedule to; None: as trained
+    polish      project the finished plans once more, in float64
+    safety      where constraints hold that do not say so themselves
+    dynamics    obey the checkpoint's linear dynamics too
+    methods     each method's constants by its name
     """
 
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
@@ -63,6 +68,7 @@ class Preset(Strict):
     extra_steps: Annotated[int, Field(ge=0)] = 0
     polish: bool = False
     safety: Literal["waypoints", "segments"] = "waypoints"
+    dynamics: bool = False
     methods: dict[str, dict[str, Any]] = {}
 
 
@@ -97,7 +103,10 @@ class Recipe(Strict):
 
 
 class Card(Strict):
-    """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like."""
+    """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
+
+    linear   share of the data's transitions that the checkpoint's linear dynamics explain; None where none were fitted
+    """
 
     task: str
     recipe: str
@@ -117,6 +126,7 @@ class Card(Strict):
     threads: int
     wall_s: float
     data: dict[str, float]
+    linear: float | None = None
 
 
 def home() -> Path:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,18 +10,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Method, Schedule
+from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
-from cdiff_cli.spec import Kind, enforced, load_constraints
-from cdiff_cli.tasks import load_task
-from cdiff_cli.training import Checkpoint, choose_device, load_checkpoint
+from cdiff_cli.spec import Dynamics, Kind, enforced, load_constraints
+from cdiff_cli.tasks import Task, load_task
+from cdiff_cli.training import choose_device
 
 Array = NDArray[np.float64]
+VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ class Resolved:
             "extra_steps": self.preset.extra_steps,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
+            "dynamics": bool(dynamics_of(self.problem.enforced)),
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -121,7 +125,6 @@ def resolve(options: Options) -> Resolved:
     if kernel not in KERNELS:
         raise CdiffError(f'no kernel "{kernel}"{suggestion(kernel, KERNELS)}; choose from {", ".join(KERNELS)}')
     path = options.constraints or shown(home() / "constraints" / recipe.constraints)
-    kinds, g = load_constraints(path, task.name, task.layout)
     device = choose_device(options.device)
     schedule = Schedule.cosine(recipe.n_steps)
     if hasattr(task, "denoiser"):
@@ -133,6 +136,7 @@ def resolve(options: Options) -> Resolved:
         denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
+    kinds, g = load_constraints(path, task.name, task.layout, checkpoint.dynamics if checkpoint else None)
     steps = preset.steps if options.steps is None else options.steps
     if steps is not None:
         if not 1 <= steps <= schedule.n_steps:
@@ -146,9 +150,20 @@ def resolve(options: Options) -> Resolved:
         if checkpoint is None or not hasattr(task, "random_point"):
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, enforced(kinds, g, preset.safety), start, goal, device)
+    obeyed = _obeyed(kinds, g, preset, task, checkpoint)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
     check_feasible(problem)
     return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
+
+
+def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:
+    """What sampling obeys: g, on segments where that is asked, and the checkpoint's dynamics where the preset asks for them."""
+    parts = enforced(kinds, g, preset.safety).parts
+    dynamics = checkpoint.dynamics if checkpoint else None
+    if preset.dynamics and dynamics is not None and not dynamics_of(g):
+        parts = (*parts, Dynamics.of(dynamics, task.layout).compile(task.layout))
+    weight = torch.tensor([VELOCITY_WEIGHT if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
+    return Constraint(tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts))
 
 
 def needed_speed(resolved: Resolved) -> tuple[float, float] | None:

@@ -14,6 +14,7 @@ from pydantic import Field, create_model, model_validator
 
 from cdiff_cli.config import Document, Strict
 from cdiff_cli.constraint import Chain, Constraint, Part, Waypoints
+from cdiff_cli.dynamics import LinearDynamics, Reachable
 from cdiff_cli.errors import suggestion
 from cdiff_cli.levels import Affine, Ellipsoid, Level, Quadric
 
@@ -147,6 +148,78 @@ class Dcbf(Strict):
         return f"h' >= {1 - self.alpha:g} h, h >= 0 where {self.barrier.describe()}"
 
 
+class Dynamics(Strict):
+    """Every step is one that x' = A x + B u + c makes with bounded inputs u: given here, or fitted to the demonstrations."""
+
+    kind: Literal["dynamics"]
+    name: str = ""
+    fit: Annotated[Literal["demonstrations"] | None, Field(description="take the dynamics that the checkpoint was fitted")] = None
+    A: Annotated[dict[str, Coordinates] | None, Field(description="row by coordinate x', column by coordinate x")] = None
+    B: Annotated[dict[str, Coordinates] | None, Field(description="row by coordinate x', column by input")] = None
+    c: Coordinates | None = None
+    inputs: Annotated[dict[str, tuple[Number, Number]] | None, Field(description="lowest and highest value of each input")] = None
+    tolerance: Annotated[PositiveNumber, Field(description="of the largest step that is missed, environment units")] = 1e-5
+
+    @model_validator(mode="after")
+    def _given_or_fitted(self) -> "Dynamics":
+        given = (self.A, self.B, self.inputs)
+        if self.fit and any(part is not None for part in (*given, self.c)):
+            raise ValueError("found both `fit` and matrices; give either `fit: demonstrations`, or A, B and inputs")
+        if not self.fit and any(part is None for part in given):
+            raise ValueError("expected `fit: demonstrations`, or A, B and inputs")
+        for row, columns in (self.B or {}).items():
+            for name in columns:
+                if name not in (self.inputs or {}):
+                    raise ValueError(f'B.{row} names the input "{name}", which `inputs` does not bound')
+        for name, (low, high) in (self.inputs or {}).items():
+            if not low < high:
+                raise ValueError(f"inputs.{name}: the lowest value, {low:g}, is not below the highest, {high:g}")
+        return self
+
+    @classmethod
+    def of(cls, dynamics: LinearDynamics, layout: Layout, name: str = "dynamics", tolerance: float = 1e-5) -> "Dynamics":
+        """The kind that gives these dynamics."""
+        inputs = [f"u{i}" for i in range(dynamics.B.shape[1])]
+        return cls(
+            kind="dynamics",
+            name=name,
+            A={row: dict(zip(layout, values, strict=True)) for row, values in zip(layout, dynamics.A.tolist(), strict=True)},
+            B={row: dict(zip(inputs, values, strict=True)) for row, values in zip(layout, dynamics.B.tolist(), strict=True)},
+            c=dict(zip(layout, dynamics.c.tolist(), strict=True)),
+            inputs=dict(zip(inputs, zip(dynamics.low.tolist(), dynamics.high.tolist(), strict=True), strict=True)),
+            tolerance=tolerance,
+        )
+
+    def coordinates(self) -> Iterator[tuple[Location, str]]:
+        for field, rows in (("A", self.A), ("B", self.B), ("c", self.c)):
+            for row in rows or {}:
+                yield (field, row), row
+        for row, columns in (self.A or {}).items():
+            yield from ((("A", row, name), name) for name in columns)
+
+    def compile(self, layout: Layout) -> Part:
+        assert self.A is not None
+        assert self.B is not None
+        assert self.inputs is not None
+        low, high = torch.tensor(list(self.inputs.values()), dtype=torch.float64).T
+        dynamics = LinearDynamics(
+            A=torch.stack([_vector(self.A.get(row, {}), layout) for row in layout]),
+            B=torch.stack([_vector(self.B.get(row, {}), list(self.inputs)) for row in layout]),
+            c=_vector(self.c or {}, layout),
+            low=low,
+            high=high,
+        )
+        n = len(layout)
+        one = torch.ones(n, dtype=torch.float64)
+        return Reachable(self.name, dynamics, torch.zeros_like(one), one, one, self.tolerance)
+
+    def describe(self) -> str:
+        if self.fit:
+            return "each step obeys the dynamics fitted to the demonstrations"
+        bounds = ", ".join(f"{low:g} <= {name} <= {high:g}" for name, (low, high) in (self.inputs or {}).items())
+        return f"each step obeys x' = A x + B u + c, {bounds}"
+
+
 class Kind(Protocol):
     """What every kind offers, ours and those of other packages."""
 
@@ -160,7 +233,7 @@ class Kind(Protocol):
 
 def kinds() -> tuple[type[Strict], ...]:
     """All kinds: the built-in ones and those of the entry-point group cdiff.constraints."""
-    return (Linear, Quadratic, Dcbf, *(entry.load() for entry in entry_points(group="cdiff.constraints")))
+    return (Linear, Quadratic, Dcbf, Dynamics, *(entry.load() for entry in entry_points(group="cdiff.constraints")))
 
 
 def file_model() -> type[Strict]:
@@ -173,8 +246,13 @@ def file_model() -> type[Strict]:
     return create_model("ConstraintFile", __base__=Strict, **fields)
 
 
-def load_constraints(path: Path, task: str, layout: Layout) -> tuple[list[Kind], Constraint]:
-    """The kinds of a constraint file and the g(x) <= 0 they compile into, environment units; raises SpecError."""
+def load_constraints(
+    path: Path, task: str, layout: Layout, dynamics: LinearDynamics | None = None
+) -> tuple[list[Kind], Constraint]:
+    """The kinds of a constraint file and the g(x) <= 0 they compile into, environment units; raises SpecError.
+
+    dynamics   what `fit: demonstrations` stands for; None where there are none
+    """
     document = Document(path)
     model = cast(Any, document.read(file_model()))
     if model.task != task:
@@ -192,6 +270,14 @@ def load_constraints(path: Path, task: str, layout: Layout) -> tuple[list[Kind],
         if named.name in seen:
             raise document.error(("constraints", i, "name"), f'the name "{named.name}" stands twice; names tell rows apart')
         seen.add(named.name)
+        if isinstance(named, Dynamics) and named.fit:
+            if dynamics is None:
+                raise document.error(
+                    ("constraints", i, "fit"),
+                    "the checkpoint has no linear dynamics: too few of its demonstrations' steps are linear in state and input; "
+                    "give A, B and inputs instead",
+                )
+            named = Dynamics.of(dynamics, layout, named.name, named.tolerance)
         parts.append(named)
     return parts, Constraint(tuple(spec.compile(layout) for spec in parts))
 

@@ -1,44 +1,28 @@
 """Fitting the denoiser; checkpoints as safetensors with a card; training that resumes to the same bits."""
 
 import contextlib
-import hashlib
 import math
-import os
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import yaml
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from cdiff_cli.data import Normaliser, Progress, Windows, demonstrations, digest, load_dataset
+from cdiff_cli.checkpoint import Checkpoint, build, read_safetensors, save_checkpoint, write_safetensors
+from cdiff_cli.data import Array, Normaliser, Progress, Windows, demonstrations, digest, load_dataset, load_inputs
 from cdiff_cli.diffusion import Schedule, Weighing, training_loss
+from cdiff_cli.dynamics import LinearDynamics, fit
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.networks import TemporalUnet
-from cdiff_cli.recipe import Card, NetworkSpec, Recipe, TrainSpec, home, shown
+from cdiff_cli.recipe import Recipe, TrainSpec, shown
 from cdiff_cli.tasks import Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A trained denoiser and what belongs to it.
-
-    demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
-    """
-
-    net: TemporalUnet
-    normaliser: Normaliser
-    demonstrations: Tensor
-    card: Card
-    path: Path
 
 
 @dataclass(frozen=True)
@@ -95,54 +79,63 @@ def train(
         columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
         windows = windows.favour_trips(spec.trips, *columns)
     commit = git_commit()
-    fit = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
+    state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
-        fit.load(work / "state.safetensors")
+        state.load(work / "state.safetensors")
     schedule, pinned = Schedule.cosine(recipe.n_steps), end_pins(recipe.horizon, len(task.layout)).to(device)
     work.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic() - fit.wall_s
+    began = time.monotonic() - state.wall_s
     try:
-        while fit.step < spec.steps:
-            loss = fit.advance(windows, schedule, pinned)
+        while state.step < spec.steps:
+            loss = state.advance(windows, schedule, pinned)
             if on_step:
-                on_step(Status(fit.step, spec.steps, loss))
-            fit.wall_s = time.monotonic() - began
-            if fit.step % save_every == 0:
-                fit.save(work / "state.safetensors")
+                on_step(Status(state.step, spec.steps, loss))
+            state.wall_s = time.monotonic() - began
+            if state.step % save_every == 0:
+                state.save(work / "state.safetensors")
     except BaseException:
-        if fit.rewind():
-            fit.save(work / "state.safetensors")
+        if state.rewind():
+            state.save(work / "state.safetensors")
         raise
-    fit.save(work / "state.safetensors")
+    state.save(work / "state.safetensors")
+    source = dataset or f"cdiff/{task.name}-v0"
+    dynamics = fit_dynamics(episodes, load_inputs(source))
     card = {
         "task": task.name,
         "recipe": size,
         "horizon": recipe.horizon,
         "n_steps": recipe.n_steps,
         "network": spec.network.model_dump(mode="json"),
-        "parameters": sum(p.numel() for p in fit.ema.parameters()),
-        "steps": fit.step,
+        "parameters": sum(p.numel() for p in state.ema.parameters()),
+        "steps": state.step,
         "seed": seed,
-        "loss": round(fit.loss_average, 7),
-        "mse": round(fit.mse_average, 7),
-        "dataset": dataset or f"cdiff/{task.name}-v0",
-        "data_sha256": fit.data_sha256,
+        "loss": round(state.loss_average, 7),
+        "mse": round(state.mse_average, 7),
+        "dataset": source,
+        "data_sha256": state.data_sha256,
         "commit": commit,
         "device": device_name(device),
         "threads": torch.get_num_threads(),
-        "wall_s": round(fit.wall_s, 1),
+        "wall_s": round(state.wall_s, 1),
         "data": data_statistics(task, episodes, recipe.horizon),
+        "linear": None if dynamics is None else round(dynamics[1], 6),
     }
     sample = windows[torch.linspace(0, len(windows.starts) - 1, SAMPLES).long()].double()
-    tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in fit.ema.state_dict().items()}
+    tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()}
     tensors |= {"normaliser.centre": normaliser.centre, "normaliser.scale": normaliser.scale}
     tensors |= {"demonstrations": normaliser.decode(sample).float()}
+    if dynamics is not None:
+        tensors |= {f"dynamics.{name}": value for name, value in vars(dynamics[0]).items()}
     return save_checkpoint(work / "model.safetensors", tensors, card)
 
 
-def build(dim: int, network: NetworkSpec) -> TemporalUnet:
-    """A network of that size, its weights drawn from the global generator."""
-    return TemporalUnet(dim, **network.model_dump())
+def fit_dynamics(episodes: Sequence[Array], inputs: Sequence[Array]) -> tuple[LinearDynamics, float] | None:
+    """Linear dynamics of the episodes and the share of their transitions that they explain; None without inputs."""
+    if not inputs:
+        return None
+    steps = [(x[:-1], u[: len(x) - 1], x[1:]) for x, u in zip(episodes, inputs, strict=True)]
+    x, u, after = (np.concatenate(part) for part in zip(*steps, strict=True))
+    return fit(x, u, after)
 
 
 def end_pins(horizon: int, dim: int) -> Tensor:
@@ -277,89 +270,6 @@ def data_statistics(task: Task, episodes: list[Any], horizon: int) -> dict[str, 
     speed = np.concatenate(travelled) / ((horizon - 1) * task.dt)
     facts |= {"speed_q50": np.quantile(speed, 0.5), "speed_q95": np.quantile(speed, 0.95), "speed_max": speed.max()}
     return {name: round(float(value), 5) for name, value in facts.items()}
-
-
-# checkpoints ----------------------------------------------------------------------------------------------------------
-
-
-def write_safetensors(path: Path, tensors: dict[str, Tensor], facts: dict[str, str] | None = None) -> None:
-    """Written beside its place and renamed, so that a reader never meets half a file."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        save_file(tensors, partial, facts)
-        partial.chmod(0o644)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def read_safetensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, str]]:
-    from safetensors import SafetensorError, safe_open
-
-    if not path.exists():
-        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
-    try:
-        with safe_open(path, "pt") as file:
-            facts = dict(file.metadata() or {})
-        return load_file(path), facts
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{shown(path)}: damaged or not a checkpoint ({error}); {advice}") from None
-
-
-def save_checkpoint(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> Checkpoint:
-    """Weights, then the card that vouches for them."""
-    write_safetensors(path, tensors)
-    card |= {"weights_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-    text = yaml.safe_dump(Card(**card).model_dump(mode="json"), sort_keys=False)
-    partial = card_path(path).with_name(f".{card_path(path).name}.{os.getpid()}")
-    partial.write_text(text)
-    os.replace(partial, card_path(path))
-    return load_checkpoint(path)
-
-
-def card_path(path: Path) -> Path:
-    return path.with_name(path.name.removesuffix(".safetensors") + ".card.yaml")
-
-
-def install(checkpoint: Checkpoint) -> Path:
-    """Put a finished checkpoint where `cdiff plan` looks; the one that stood there is kept as <recipe>.previous."""
-    folder = home() / "models" / checkpoint.card.task
-    target = folder / f"{checkpoint.card.recipe}.safetensors"
-    if target.exists():
-        previous = folder / f"{checkpoint.card.recipe}.previous.safetensors"
-        if card_path(target).exists():
-            os.replace(card_path(target), card_path(previous))
-        os.replace(target, previous)
-    tensors, _ = read_safetensors(checkpoint.path, "train again")
-    save_checkpoint(target, tensors, checkpoint.card.model_dump(mode="json"))
-    return target
-
-
-def load_checkpoint(path: Path, task: str | None = None, device: torch.device | str = "cpu") -> Checkpoint:
-    """A checkpoint with its card; CheckpointError where either is missing, damaged, or of another task."""
-    from cdiff_cli.config import load
-
-    advice = f"train one with `cdiff train --task {task or path.parent.name}`, or name another with --checkpoint"
-    if not path.exists():
-        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
-    if not card_path(path).exists():
-        raise CheckpointError(f"{shown(card_path(path))}: the checkpoint's card is missing; {advice}")
-    card = load(card_path(path), Card)
-    if task is not None and card.task != task:
-        raise CheckpointError(f"{shown(path)}: a checkpoint of {card.task}, asked for was {task}; {advice}")
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found != card.weights_sha256:
-        raise CheckpointError(
-            f"{shown(path)}: truncated or altered: sha256 {found[:12]}..., its card says {card.weights_sha256[:12]}...; "
-            f"restore it, or {advice}"
-        )
-    tensors, _ = read_safetensors(path, advice)
-    normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
-    windows = tensors.pop("demonstrations")
-    with torch.random.fork_rng(devices=[]):
-        net = build(windows.shape[-1], card.network)
-    net.load_state_dict({name.removeprefix("net."): value.float() for name, value in tensors.items()})
-    return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path)
 
 
 def git_commit() -> str:

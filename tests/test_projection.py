@@ -6,9 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cdiff_cli.closed_forms import nearest
 from cdiff_cli.constraint import Constraint, Pins, stack
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
-from cdiff_cli.projection import nearest, project
+from cdiff_cli.projection import project
 from tests.problems import (
     F64,
     KINDS,

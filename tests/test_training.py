@@ -10,23 +10,14 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
+import cdiff_cli.checkpoint
 import cdiff_cli.training
+from cdiff_cli.checkpoint import Checkpoint, card_path, install, load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.config import load
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.recipe import Card, DemonstrationSpec, NetworkSpec, Recipe, TrainSpec, load_recipe
 from cdiff_cli.tasks.maze2d import UMAZE
-from cdiff_cli.training import (
-    Checkpoint,
-    card_path,
-    choose_device,
-    data_statistics,
-    end_pins,
-    install,
-    load_checkpoint,
-    read_safetensors,
-    save_checkpoint,
-    train,
-)
+from cdiff_cli.training import choose_device, data_statistics, end_pins, train
 
 MODELS = Path(__file__).parent.parent / "models"
 SHIPPED = sorted(MODELS.glob("*/small.safetensors"))
@@ -298,7 +289,7 @@ def test_a_checkpoint_of_another_task_is_refused_with_advice(whole):
 
 
 def test_install_keeps_the_previous_checkpoint(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(cdiff_cli.training, "home", lambda: tmp_path)
+    monkeypatch.setattr(cdiff_cli.checkpoint, "home", lambda: tmp_path)
     folder = tmp_path / "models" / "maze2d-umaze"
     folder.mkdir(parents=True)
     target = install(whole)

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import sparse
 
-from cdiff_cli.projection import nearest_chain, pool_violators
+from cdiff_cli.closed_forms import nearest_chain, pool_violators
 
 INTERIOR_POINT = {"cvxopt", "kvxopt", "qpax", "qtqp", "ecos", "clarabel"}
 DATA = ("noise", "walk", "smooth")

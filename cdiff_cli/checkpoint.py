@@ -1,0 +1,122 @@
+"""Checkpoints: weights as safetensors, and the card that vouches for them."""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from cdiff_cli.data import Normaliser
+from cdiff_cli.dynamics import LinearDynamics
+from cdiff_cli.errors import CheckpointError
+from cdiff_cli.networks import TemporalUnet
+from cdiff_cli.recipe import Card, NetworkSpec, home, shown
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A trained denoiser and what belongs to it.
+
+    dynamics         linear dynamics fitted to the training data, environment units; None where there were no inputs to fit
+
+    demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
+    """
+
+    net: TemporalUnet
+    normaliser: Normaliser
+    demonstrations: Tensor
+    card: Card
+    path: Path
+    dynamics: LinearDynamics | None = None
+
+
+def build(dim: int, network: NetworkSpec) -> TemporalUnet:
+    """A network of that size, its weights drawn from the global generator."""
+    return TemporalUnet(dim, **network.model_dump())
+
+
+def write_safetensors(path: Path, tensors: dict[str, Tensor], facts: dict[str, str] | None = None) -> None:
+    """Written beside its place and renamed, so that a reader never meets half a file."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(tensors, partial, facts)
+        partial.chmod(0o644)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_safetensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.exists():
+        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
+    try:
+        with safe_open(path, "pt") as file:
+            facts = dict(file.metadata() or {})
+        return load_file(path), facts
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{shown(path)}: damaged or not a checkpoint ({error}); {advice}") from None
+
+
+def save_checkpoint(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> Checkpoint:
+    """Weights, then the card that vouches for them."""
+    write_safetensors(path, tensors)
+    card |= {"weights_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    text = yaml.safe_dump(Card(**card).model_dump(mode="json"), sort_keys=False)
+    partial = card_path(path).with_name(f".{card_path(path).name}.{os.getpid()}")
+    partial.write_text(text)
+    os.replace(partial, card_path(path))
+    return load_checkpoint(path)
+
+
+def card_path(path: Path) -> Path:
+    return path.with_name(path.name.removesuffix(".safetensors") + ".card.yaml")
+
+
+def install(checkpoint: Checkpoint) -> Path:
+    """Put a finished checkpoint where `cdiff plan` looks; the one that stood there is kept as <recipe>.previous."""
+    folder = home() / "models" / checkpoint.card.task
+    target = folder / f"{checkpoint.card.recipe}.safetensors"
+    if target.exists():
+        previous = folder / f"{checkpoint.card.recipe}.previous.safetensors"
+        if card_path(target).exists():
+            os.replace(card_path(target), card_path(previous))
+        os.replace(target, previous)
+    tensors, _ = read_safetensors(checkpoint.path, "train again")
+    save_checkpoint(target, tensors, checkpoint.card.model_dump(mode="json"))
+    return target
+
+
+def load_checkpoint(path: Path, task: str | None = None, device: torch.device | str = "cpu") -> Checkpoint:
+    """A checkpoint with its card; CheckpointError where either is missing, damaged, or of another task."""
+    from cdiff_cli.config import load
+
+    advice = f"train one with `cdiff train --task {task or path.parent.name}`, or name another with --checkpoint"
+    if not path.exists():
+        raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
+    if not card_path(path).exists():
+        raise CheckpointError(f"{shown(card_path(path))}: the checkpoint's card is missing; {advice}")
+    card = load(card_path(path), Card)
+    if task is not None and card.task != task:
+        raise CheckpointError(f"{shown(path)}: a checkpoint of {card.task}, asked for was {task}; {advice}")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found != card.weights_sha256:
+        raise CheckpointError(
+            f"{shown(path)}: truncated or altered: sha256 {found[:12]}..., its card says {card.weights_sha256[:12]}...; "
+            f"restore it, or {advice}"
+        )
+    tensors, _ = read_safetensors(path, advice)
+    normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
+    windows = tensors.pop("demonstrations")
+    fitted = {name.removeprefix("dynamics."): tensors.pop(name) for name in list(tensors) if name.startswith("dynamics.")}
+    with torch.random.fork_rng(devices=[]):
+        net = build(windows.shape[-1], card.network)
+    net.load_state_dict({name.removeprefix("net."): value.float() for name, value in tensors.items()})
+    dynamics = LinearDynamics(**fitted) if fitted else None
+    return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path, dynamics)
