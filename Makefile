@@ -2,7 +2,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 TIGHT := --constraints constraints/maze2d-umaze-tight.yaml
 
-.PHONY: demo test lint benchmark clean
+.PHONY: demo test lint benchmark oracle clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
 	$(BIN)/cdiff plan --method diffuser $(TIGHT) --runs runs/demo --json >/dev/null
@@ -21,6 +21,9 @@ lint: .venv/.ready
 
 benchmark: .venv/.ready  ## timings, as ratios within one run
 	$(BIN)/python tests/benchmarks/constraint_share.py
+
+oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
+	$(BIN)/python tests/benchmarks/oracle.py
 
 .venv/.ready: requirements.txt pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv
