@@ -147,11 +147,11 @@ CONSTRAINTS = {
 
 
 def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
-    """The law in place of a trained model: start and goal pinned, cosine schedule."""
+    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the waypoints, where the truth has it."""
     schedule = Schedule.cosine(n_steps)
     scale = Normaliser(torch.zeros(2, dtype=F64), torch.full((2,), SCALE, dtype=F64))
     start, goal = law.means[0, [0, -1]].numpy()
-    return Problem(law, law.horizon, law.denoiser(schedule), schedule, scale, g, start, goal, torch.device("cpu"))
+    return Problem(law, law.horizon, law.denoiser(schedule), schedule, scale, g, g, start, goal, torch.device("cpu"))
 
 
 # what separates samples from the truth ------------------------------------------------------------------------------------
