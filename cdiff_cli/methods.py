@@ -23,6 +23,7 @@ from cdiff_cli.projection import project_from
 On = Literal["noisy", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
+Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
 
 
@@ -41,10 +42,13 @@ class Unconstrained:
 class Projected:
     """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean.
 
+    correction   on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
+                 x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
     rounds   of ADMM a step where dynamics are to be obeyed, from where the step before ended; other projections are exact
     """
 
     on: On = "clean"
+    correction: Correction = "kernel"
     rounds: int = 30
 
     def init(self, x: Traj, g: Constraint) -> Warm | None:
@@ -53,7 +57,9 @@ class Projected:
     def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
         if self.on == "clean":
             x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
-            return step.reverse(x0), state
+            if self.correction == "kernel":
+                return step.reverse(x0), state
+            return step.reverse(step.x0) + step.level * (x0 - step.x0), state
         return project_from(g, step.reverse(step.x0), step.pins, state, self.rounds)
 
 
