@@ -134,6 +134,12 @@ def dynamics_of(g: Constraint) -> list[Reachable]:
     return [part for part in g.parts if isinstance(part, Reachable)]
 
 
+def split(g: Constraint) -> tuple[Constraint, Constraint]:
+    """g without its dynamics, and its dynamics alone."""
+    found = dynamics_of(g)
+    return Constraint(tuple(part for part in g.parts if part not in found)), Constraint(tuple(found))
+
+
 def fit(x: Array, u: Array, after: Array) -> tuple[LinearDynamics, float]:
     """Least squares on the transitions (x, u, after) [k, n], [k, m], [k, n], refitted to those within three median residuals
     until that set is stable, so that collisions and clipped speeds drop out. Also the share of transitions so explained, to

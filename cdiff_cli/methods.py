@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import Warm, dynamics_of
+from cdiff_cli.dynamics import Warm, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
 
@@ -71,6 +71,9 @@ class PrimalDual:
             lam_{t-1} = [lam_t + eta E g(x_t)]_+                      (paper, Eq. dual)
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
+    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
+    `rounds` rounds of ADMM.
+
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
     expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
@@ -82,9 +85,10 @@ class PrimalDual:
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
+    rounds: int = 10
 
     def init(self, x: Traj, g: Constraint) -> Rows:
-        return zeros(x, g, self.expectation)
+        return zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation)
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
@@ -93,8 +97,10 @@ class PrimalDual:
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
+        g, dynamics = split(g)
         rows, pull, size = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
         rows, _, size = linearise(g, x0, self.positive)
         dual = expect(rows / size.clamp_min(1e-12), self.expectation)
         return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)

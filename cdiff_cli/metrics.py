@@ -15,6 +15,7 @@ from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
+SAFE = 1e-6  # g up to here counts as safe in shares: the rounding of float32 samplers. Certificates allow nothing
 
 
 def violation(g: Constraint, x: Array) -> Array:
@@ -106,8 +107,8 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "violation": violation(g, x),
         "worst_waypoint": worst_waypoint(g, x),
         "worst_segment": worst_segment(g, x),
-        "safe_waypoints": (worst_waypoint(g, x) <= 0).astype(np.float64),
-        "safe_segments": ((worst_waypoint(g, x) <= 0) & (worst_segment(g, x) <= 0)).astype(np.float64),
+        "safe_waypoints": (worst_waypoint(g, x) <= SAFE).astype(np.float64),
+        "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),
         "violation_paper": violation(g, x) * paper_units.violation,
         "distance_paper": distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power),
@@ -172,4 +173,4 @@ def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
     """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0."""
     level = getattr(part, "level", None)
     values = level(torch.from_numpy(x)) if level is not None else part(torch.from_numpy(x)).amax(1, keepdim=True)
-    return np.broadcast_to((values > 0).numpy(), x.shape[:2])
+    return np.broadcast_to((values > SAFE).numpy(), x.shape[:2])
