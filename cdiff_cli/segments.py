@@ -126,7 +126,7 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tenso
     e_mid = _unit(at(near, middle), at(_sideways(aside, across), middle))
     walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
     half = (walked[:, :-1] + walked[:, 1:]) / 2  # at the middle of each segment
-    begin, end = half.gather(1, run), half.gather(1, stop)
+    begin, end = walked.gather(1, run), walked.gather(1, stop + 1)
     share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
     to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
     angle = share * (to_mid + to_out)
