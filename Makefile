@@ -1,14 +1,14 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
-TIGHT := --constraints constraints/maze2d-umaze-tight.yaml
+SLALOM := --constraints constraints/maze2d-umaze-slalom.yaml
 
-.PHONY: demo test lint benchmark oracle clean
+.PHONY: demo test lint tables benchmark oracle clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
-	$(BIN)/cdiff plan --method diffuser $(TIGHT) --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method projected $(TIGHT) --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method primal-dual $(TIGHT) --runs runs/demo --json >/dev/null
-	$(BIN)/cdiff plan --method alm $(TIGHT) --runs runs/demo
+	$(BIN)/cdiff plan --method diffuser $(SLALOM) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method projected $(SLALOM) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method primal-dual $(SLALOM) --runs runs/demo --json >/dev/null
+	$(BIN)/cdiff plan --method alm $(SLALOM) --runs runs/demo
 	$(BIN)/cdiff compare runs/demo
 
 test: lint  ## lint, types, tests
@@ -18,6 +18,9 @@ lint: .venv/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+tables: .venv/.ready  ## the tables of the README from runs/reference
+	$(BIN)/python tests/readme_tables.py
 
 benchmark: .venv/.ready  ## timings, as ratios within one run
 	$(BIN)/python tests/benchmarks/constraint_share.py

@@ -259,13 +259,13 @@ def rollout(
         raise CdiffError(f"--video: expected gif or mp4, found {video}")
     from cdiff_cli.experiment import rollout_run
     from cdiff_cli.request import resolve
-    from cdiff_cli.runs import QUALITY_TABLE, ROLLOUT_TABLE
+    from cdiff_cli.runs import QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
 
     resolved = resolve(options(given))
     warn_of_speed(resolved)
     with progress() as tick:
         finished = rollout_run(resolved, runs, tick, video)
-    finish(finished, tuple(dict.fromkeys((*ROLLOUT_TABLE, *QUALITY_TABLE))), as_json)
+    finish(finished, tuple(dict.fromkeys((*SAFETY_TABLE, *ROLLOUT_TABLE, *QUALITY_TABLE))), as_json)
 
 
 @app.command()
@@ -315,7 +315,7 @@ def compare(
         raise CdiffError(f"{folder}: no runs{f' of {task}' if task else ''} here; make one first: cdiff plan --method alm")
     values = tables.read_paper(home() / "runs" / "reference" / "paper.csv") if paper else None
     plan_table = runs.PAPER_TABLE if paper else runs.PLAN_TABLE
-    wanted = [("plans", plans, plan_table), ("rollouts", rollouts, (*runs.ROLLOUT_TABLE, "wall", "smooth"))]
+    wanted = [("plans", plans, plan_table), ("rollouts", rollouts, tuple(dict.fromkeys((*runs.SAFETY_TABLE, *runs.ROLLOUT_TABLE))))]
     shown = [(title, runs.compare(rows), table) for title, rows, table in wanted if rows]
     if style == "json":
         found = {title: json.loads(tables.render(groups, table, style, values)) for title, groups, table in shown}

@@ -115,6 +115,7 @@ class Step:
 
     x, x0     x_t and its clean estimate, pins painted, normalised   [batch, horizon, dim]
     beta      beta_t
+    level     sqrt(alpha_bar_{t-1}), the share of the clean trajectory in x_{t-1}
     reverse   clean estimate -> x_{t-1}; noise z and pins already bound; the next step's kernel knows the last estimate given
     last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
     """
@@ -122,6 +123,7 @@ class Step:
     x: Traj
     x0: Traj
     beta: float
+    level: float
     reverse: Callable[[Traj], Traj]
     pins: Pins
     last: bool
@@ -186,7 +188,7 @@ def sample(
             used = clean, a
             return pins.paint(kernel(x, clean, z, a, b, previous))
 
-        step = Step(here, x0, schedule.beta(i), reverse, pins, last)
+        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last)
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)

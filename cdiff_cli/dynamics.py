@@ -55,10 +55,13 @@ class LinearDynamics:
             states.append(self(states[-1], u[:, tau]))
         return torch.stack(states, 1)
 
+    def wanted(self, x: Traj) -> Tensor:
+        """The inputs that come closest to producing x, whatever their size [batch, horizon - 1, m]."""
+        return (x[:, 1:] - x[:, :-1] @ self.A.T - self.c) @ torch.linalg.pinv(self.B).T
+
     def inputs(self, x: Traj) -> Tensor:
-        """The inputs that come closest to producing x, within their bounds [batch, horizon - 1, m]."""
-        change = x[:, 1:] - x[:, :-1] @ self.A.T - self.c
-        return torch.clamp(change @ torch.linalg.pinv(self.B).T, self.low, self.high)
+        """The same, cut to the inputs' bounds."""
+        return torch.clamp(self.wanted(x), self.low, self.high)
 
     def residual(self, x: Traj) -> Tensor:
         """|x' - A x - B u - c| of each step under those inputs [batch, horizon - 1]."""
@@ -129,6 +132,12 @@ class Reachable:
 def dynamics_of(g: Constraint) -> list[Reachable]:
     """The parts that ask for dynamics to be obeyed."""
     return [part for part in g.parts if isinstance(part, Reachable)]
+
+
+def split(g: Constraint) -> tuple[Constraint, Constraint]:
+    """g without its dynamics, and its dynamics alone."""
+    found = dynamics_of(g)
+    return Constraint(tuple(part for part in g.parts if part not in found)), Constraint(tuple(found))
 
 
 def fit(x: Array, u: Array, after: Array) -> tuple[LinearDynamics, float]:

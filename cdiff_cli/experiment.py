@@ -111,11 +111,15 @@ def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
         "step_ms": 1e3 * plans.total_s / plans.calls,
         "overhead": 100 * (plans.total_s - plans.network_s) / max(plans.network_s, 1e-9),
     }
+    dynamics = resolved.checkpoint.dynamics if resolved.checkpoint else None
+    effort = None if dynamics is None else metrics.effort(dynamics, plans.x)
     rows = []
     for i, (seed, values) in enumerate(zip(resolved.seeds, measured, strict=True)):
         row: Row = resolved.row() | {"seed": seed} | values | {"polish": float(plans.polish[i])} | cost
         if resolved.checkpoint is not None:
             row["smooth"] = float(values["jump"] <= 1.2 * resolved.checkpoint.card.data["jump_q999"])
+        if effort is not None:
+            row |= {"effort": float(effort[0][i]), "feasible": float(effort[1][i])}
         rows.append(row)
     return rows
 

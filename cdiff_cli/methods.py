@@ -16,13 +16,14 @@ from torch.nn import functional as F
 
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import Warm, dynamics_of
+from cdiff_cli.dynamics import Warm, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
 
 On = Literal["noisy", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
+Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
 
 
@@ -41,10 +42,13 @@ class Unconstrained:
 class Projected:
     """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean.
 
+    correction   on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
+                 x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
     rounds   of ADMM a step where dynamics are to be obeyed, from where the step before ended; other projections are exact
     """
 
     on: On = "clean"
+    correction: Correction = "kernel"
     rounds: int = 30
 
     def init(self, x: Traj, g: Constraint) -> Warm | None:
@@ -53,7 +57,9 @@ class Projected:
     def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
         if self.on == "clean":
             x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
-            return step.reverse(x0), state
+            if self.correction == "kernel":
+                return step.reverse(x0), state
+            return step.reverse(step.x0) + step.level * (x0 - step.x0), state
         return project_from(g, step.reverse(step.x0), step.pins, state, self.rounds)
 
 
@@ -64,6 +70,9 @@ class PrimalDual:
     noisy:  x_{t-1} = reverse(x0) - c_t lam_t^T dg(x_t)               (paper, Eq. pri)
             lam_{t-1} = [lam_t + eta E g(x_t)]_+                      (paper, Eq. dual)
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
+
+    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
+    `rounds` rounds of ADMM.
 
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
@@ -76,9 +85,10 @@ class PrimalDual:
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
+    rounds: int = 10
 
     def init(self, x: Traj, g: Constraint) -> Rows:
-        return zeros(x, g, self.expectation)
+        return zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation)
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
@@ -87,8 +97,10 @@ class PrimalDual:
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
+        g, dynamics = split(g)
         rows, pull, size = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
         rows, _, size = linearise(g, x0, self.positive)
         dual = expect(rows / size.clamp_min(1e-12), self.expectation)
         return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)

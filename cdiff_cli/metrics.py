@@ -11,9 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint, Part
+from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
+SAFE = 1e-6  # g up to here counts as safe in shares: the rounding of float32 samplers. Certificates allow nothing
 
 
 def violation(g: Constraint, x: Array) -> Array:
@@ -68,6 +70,16 @@ def acceleration(x: Array, velocities: Sequence[int], dt: float) -> Array:
     return np.asarray(_steps(x, velocities).max(-1, initial=0.0) / dt)
 
 
+def effort(dynamics: LinearDynamics, x: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Largest input that a step of each plan asks for, over its bound (least squares); and whether the dynamics make every
+    step, to 1e-5, within the bounds. Both [n]
+    """
+    states = torch.from_numpy(x)
+    middle, half = (dynamics.high + dynamics.low) / 2, (dynamics.high - dynamics.low) / 2
+    asked = ((dynamics.wanted(states) - middle) / half).abs().flatten(1)
+    return _largest(asked).numpy(), (dynamics.residual(states) <= 1e-5).all(1).numpy()
+
+
 def hits_wall(x: Array, columns: Sequence[int], boxes: Array) -> NDArray[np.bool_]:
     """Whether a waypoint or a segment between waypoints enters a box (x_min, y_min, x_max, y_max) [n]."""
     if len(boxes) == 0:
@@ -95,6 +107,8 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "violation": violation(g, x),
         "worst_waypoint": worst_waypoint(g, x),
         "worst_segment": worst_segment(g, x),
+        "safe_waypoints": (worst_waypoint(g, x) <= SAFE).astype(np.float64),
+        "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),
         "violation_paper": violation(g, x) * paper_units.violation,
         "distance_paper": distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power),
@@ -123,6 +137,7 @@ def rollout_metrics(
     return [
         {
             "reward": float(np.nansum(reward[i])),
+            "safe_executed": float(not unsafe[i].any()),
             "executed_violation": float(rows[i].clamp_min(0).nan_to_num(0.0).sum()),
             "executed_worst": float(_largest(rows[i : i + 1])[0]),
             "violation_rate": 100.0 * float(unsafe[i].sum()) / max(int(steps[i]) + 1, 1),
@@ -158,4 +173,4 @@ def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
     """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0."""
     level = getattr(part, "level", None)
     values = level(torch.from_numpy(x)) if level is not None else part(torch.from_numpy(x)).amax(1, keepdim=True)
-    return np.broadcast_to((values > 0).numpy(), x.shape[:2])
+    return np.broadcast_to((values > SAFE).numpy(), x.shape[:2])

@@ -40,6 +40,10 @@ COLUMNS = {
     "acceleration": Column("acceleration / m/s^2", 1, "largest |v' - v| / dt"),
     "smooth": Column("smooth", 2, "share of plans whose largest jump is at most 1.2 times the data's 99.9 % quantile"),
     "wall": Column("in wall", 2, "share of plans with a waypoint or segment inside a wall"),
+    "safe_waypoints": Column("safe at waypoints", 2, "share of plans with no g above 1e-6 at a waypoint"),
+    "safe_segments": Column("safe between", 2, "share of plans with no g above 1e-6 at or between the waypoints"),
+    "feasible": Column("feasible", 2, "share of plans whose every step the fitted dynamics make with inputs within their bounds"),
+    "effort": Column("effort", 2, "largest input that a step of the plan asks for, over its bound; above 1 no actuator follows"),
     "polish": Column("polish / m", 5, "largest displacement by the final exact projection"),
     "calls": Column("calls", 0, "network calls a plan"),
     "plan_ms": Column("plan / ms", 1, "wall time of the batch over its number of plans"),
@@ -48,6 +52,7 @@ COLUMNS = {
     "violation_paper": Column("violation (paper)", 4, "violation in the paper's units"),
     "distance_paper": Column("distance (paper)", 2, "the paper's definition: distance to the mean unconstrained plan"),
     "reward": Column("return", 1, "sum of rewards"),
+    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6"),
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
@@ -59,6 +64,17 @@ KEYS = ("task", "constraints", "method", "preset")
 PLAN_TABLE = ("distance", "violation", "worst_waypoint", "worst_segment", "jump", "mean_speed", "calls", "plan_ms", "step_ms")
 QUALITY_TABLE = ("wall", "smooth", "jump", "residual", "acceleration", "mean_speed", "success", "goal_distance")
 ROLLOUT_TABLE = ("success", "executed_violation", "executed_worst", "violation_rate", "goal_distance", "reward", "steps")
+SAFETY_TABLE = (
+    "safe_waypoints",
+    "safe_segments",
+    "feasible",
+    "safe_executed",
+    "violation_rate",
+    "success",
+    "wall",
+    "effort",
+    "distance",
+)
 PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
 
 

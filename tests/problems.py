@@ -130,7 +130,7 @@ def langevin_chain(method, g, *, steps, batch, beta, seed):
     pins, state, states = Pins.none(x), method.init(x, g), []
     for _ in range(steps):
         z = torch.randn(x.shape, generator=rng, dtype=F64)
-        step = Step(x, x, beta, lambda _, x=x, z=z: x - beta / 2 * x + math.sqrt(beta) * z, pins, False)
+        step = Step(x, x, beta, 1.0, lambda _, x=x, z=z: x - beta / 2 * x + math.sqrt(beta) * z, pins, False)
         x, state = method.step(step, g, state)
         states.append(state)
     return x, states

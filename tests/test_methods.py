@@ -40,7 +40,7 @@ SCHEDULE = Schedule.cosine(30)
 
 def _step(x, x0=None, beta=0.1, pins=None):
     """A step whose reverse is the identity, so that the method's own change is all that is seen."""
-    return Step(x, x if x0 is None else x0, beta, lambda clean: clean, pins or Pins.none(x), False)
+    return Step(x, x if x0 is None else x0, beta, 1.0, lambda clean: clean, pins or Pins.none(x), False)
 
 
 def _unit_mean_shift(method):
@@ -246,3 +246,14 @@ def test_make_method_reads_numbers_written_as_strings():
 def test_make_method_says_what_is_wrong(name, values, message):
     with pytest.raises(CdiffError, match=message):
         make_method(name, values)
+
+
+def test_latent_correction_moves_the_sample_by_the_whole_projection():
+    """x_{t-1} = reverse(x0) + level (P(x0) - x0), by hand: x0 = 2 projected onto x <= 1, reverse halves, level 0.8."""
+    x = torch.full((1, 1, 1), 2.0)
+    step = Step(x, x, 0.1, 0.8, lambda clean: clean / 2, Pins.none(x), False)
+    g = waypoints(Affine(torch.ones(1), torch.ones(())))
+    kernel, _ = Projected().step(step, g, None)
+    latent, _ = Projected(correction="latent").step(step, g, None)
+    assert float(kernel) == pytest.approx(0.5)
+    assert float(latent) == pytest.approx(1.0 - 0.8)

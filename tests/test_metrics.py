@@ -180,6 +180,7 @@ def test_rollout_metrics_stop_where_the_episode_stops():
     first, second = rollout_metrics(LEFT, x, reward, np.array([True, False]), np.array([0.1, 2.0]))
     assert first == {
         "reward": 1.5,
+        "safe_executed": 0.0,
         "executed_violation": 2.5,
         "executed_worst": 2.0,
         "violation_rate": pytest.approx(200 / 3),

@@ -216,7 +216,7 @@ def test_the_latent_step_is_the_kernel_from_the_shifted_sample(kernel):
     a, b = SCHEDULE.alpha_bar[i], SCHEDULE.alpha_bar[i - 1]
     x, x0, z = (normal(seed, 4, 32, 2) for seed in range(3))
     pins = Pins.none(x)
-    step = Step(x, x0, SCHEDULE.beta(i), lambda clean: KERNELS[kernel](x, clean, z, a, b), pins, False)
+    step = Step(x, x0, SCHEDULE.beta(i), math.sqrt(b), lambda clean: KERNELS[kernel](x, clean, z, a, b), pins, False)
     latent, _ = Latent(Projected(), SCHEDULE).step(step, g, (None, i))
     clean, _ = Projected().step(replace(step, reverse=lambda clean: clean), g, None)
     torch.testing.assert_close(latent, KERNELS[kernel](x + math.sqrt(a) * (clean - x0), clean, z, a, b), atol=1e-12, rtol=0)

@@ -1,0 +1,53 @@
+"""The tables of the README, made from the rows in runs/reference/: `make tables` writes them, a test fails when they drift.
+
+In the README a table stands between `<!-- table NAME -->` and `<!-- end -->`.
+"""
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from cdiff_cli import runs, tables
+
+ROOT = Path(__file__).parent.parent
+REFERENCE = ROOT / "runs" / "reference"
+MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "wall", "calls")
+SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
+QUALITY = ("wall", "smooth", "success", "jump", "residual", "acceleration", "effort", "goal_distance")
+
+
+def of_rows(name: str, columns: tuple[str, ...], paper: bool = False) -> str:
+    """A comparison of the rows in runs/reference/NAME/rows.csv."""
+    values = tables.read_paper(REFERENCE / "paper.csv") if paper else None
+    return tables.render(runs.compare(runs.read_rows(REFERENCE / name / "rows.csv")), columns, "markdown", values)
+
+
+def of_metrics() -> str:
+    """What each column means."""
+    lines = [f"| {column.title} | {column.meaning.replace('|', '&#124;')} |" for column in runs.COLUMNS.values()]
+    return "\n".join(["| column | definition |", "| --- | --- |", *lines])
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "table1-umaze": lambda: of_rows("table1-umaze", PAPER, paper=True),
+    "table1-large": lambda: of_rows("table1-large", PAPER, paper=True),
+    "safety-umaze": lambda: of_rows("safety-umaze", SAFETY),
+    "safety-large": lambda: of_rows("safety-large", SAFETY),
+    "quality": lambda: of_rows("quality", QUALITY),
+    "metrics": of_metrics,
+}
+
+
+def filled(text: str) -> str:
+    """The text with every marked table made anew."""
+    return MARKED.sub(lambda found: f"{found[1]}{TABLES[found[2]]()}\n{found[3]}", text)
+
+
+if __name__ == "__main__":
+    readme = ROOT / "README.md"
+    old = readme.read_text()
+    readme.write_text(filled(old))
+    sys.stderr.write("README.md: its tables are up to date\n" if filled(old) == old else "README.md: tables rewritten\n")
