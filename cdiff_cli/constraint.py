@@ -49,6 +49,11 @@ class Part(Protocol):
 
     @property
     def name(self) -> str: ...
+    @property
+    def spans(self) -> bool:
+        """Whether it asks anything of the segments between waypoints; one that does not is as safe there as at them."""
+        ...
+
     def labels(self, horizon: int) -> list[str]: ...
     def __call__(self, x: Traj) -> Rows: ...
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
@@ -79,6 +84,8 @@ class Waypoints:
 
     name: str
     level: Level
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}" for tau in range(horizon)]
@@ -114,6 +121,8 @@ class Segments:
 
     name: str
     level: Level
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}~{tau + 1}" for tau in range(horizon - 1)]
@@ -157,6 +166,8 @@ class Chain:
     name: str
     level: Level
     alpha: float
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
@@ -208,6 +219,8 @@ class Opaque:
     fn: Callable[[Traj], Rows]
     count: Callable[[int], int]
     margin: float = 0.0
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{i}" for i in range(self.count(horizon))]

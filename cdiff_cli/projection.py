@@ -54,7 +54,6 @@ def _reach(
     part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int
 ) -> tuple[Traj, Warm | None]:
     """ADMM in environment units on the coordinates that the other parts constrain."""
-    others = [piece for other in others for piece in other.on_segments()]
     back = (-part.centre / part.scale, 1 / part.scale)
     used = _coordinates(others, z.shape[-1])
     narrow = [_restricted(other.pull_back(*back), used) for other in others]
