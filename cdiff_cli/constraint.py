@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.levels import Level, moved, segment_max
+from cdiff_cli.levels import Level, Quadric, moved, segment_max
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -112,7 +112,7 @@ class Waypoints:
         return segment_max(self.level, x[:, :-1], x[:, 1:])
 
     def on_segments(self) -> "tuple[Part, ...]":
-        return (self if self.level.convex else Segments(self.name, self.level),)
+        return (self if self.level.convex else _segments(self.name, self.level),)
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,12 @@ class Segments:
 
     def on_segments(self) -> "tuple[Part, ...]":
         return (self,)
+
+
+def _segments(name: str, level: Level) -> Segments:
+    """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
+    ball = level.ball() if isinstance(level, Quadric) else None
+    return Segments(name, ball or level)
 
 
 @dataclass(frozen=True)
@@ -204,7 +210,7 @@ class Chain:
 
     def on_segments(self) -> "tuple[Part, ...]":
         """The chain, and its barrier on the segments where the waypoints' safety does not give it."""
-        return (self,) if self.level.convex else (self, Segments(self.name, self.level))
+        return (self,) if self.level.convex else (self, _segments(self.name, self.level))
 
 
 @dataclass(frozen=True)
