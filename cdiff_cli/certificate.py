@@ -134,9 +134,11 @@ def _at_waypoints(part: Part, x: Array, task: Task) -> list[Entry]:
 def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
     """The worst value on the straight segments between the waypoints of each plan, and the first point that has it.
 
-    A part over a level has the exact maximum (Level.worst); of any other it is only what was found, and no promise.
+    A part over a level has the exact maximum (Level.worst), one that asks nothing between waypoints its own values; of any
+    other it is only what was found, and no promise.
     """
     level: Level | None = getattr(part, "level", None)
+    exact = level is not None or not part.spans
     rows = _values(between(part, _tensor(x)))
     at = [_first_worst(values) for values in rows]
     if level is None or any(segment is None for segment in at):
@@ -151,7 +153,7 @@ def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
             for j, s, p in zip(segment, share, point, strict=True)
         ]
     return [
-        {"worst": _largest(values)} | place | {"exact": level is not None, "safe": level is not None and bool((values <= 0).all())}
+        {"worst": _largest(values)} | place | {"exact": exact, "safe": exact and bool((values <= 0).all())}
         for values, place in zip(rows, places, strict=True)
     ]
 

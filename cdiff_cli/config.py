@@ -139,7 +139,7 @@ def _explain(error: dict[str, Any]) -> str:
         names = known.replace("'", "").split(", ")
         return f'no kind "{tag}"{suggestion(tag, names)}; expected one of {known}'
     if kind == "union_tag_not_found":
-        return "it has no kind; add `kind: linear`, `quadratic` or `dcbf`"
+        return "it has no kind; add `kind: linear`, `quadratic`, `dcbf` or `dynamics`"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.levels import Level, moved, segment_max
+from cdiff_cli.levels import Level, Quadric, moved, segment_max
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -49,6 +49,11 @@ class Part(Protocol):
 
     @property
     def name(self) -> str: ...
+    @property
+    def spans(self) -> bool:
+        """Whether it asks anything of the segments between waypoints; one that does not is as safe there as at them."""
+        ...
+
     def labels(self, horizon: int) -> list[str]: ...
     def __call__(self, x: Traj) -> Rows: ...
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
@@ -80,6 +85,8 @@ class Waypoints:
     name: str
     level: Level
 
+    spans = True
+
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}" for tau in range(horizon)]
 
@@ -105,7 +112,7 @@ class Waypoints:
         return segment_max(self.level, x[:, :-1], x[:, 1:])
 
     def on_segments(self) -> "tuple[Part, ...]":
-        return (self if self.level.convex else Segments(self.name, self.level),)
+        return (self if self.level.convex else _segments(self.name, self.level),)
 
 
 @dataclass(frozen=True)
@@ -114,6 +121,8 @@ class Segments:
 
     name: str
     level: Level
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}~{tau + 1}" for tau in range(horizon - 1)]
@@ -150,6 +159,12 @@ class Segments:
         return (self,)
 
 
+def _segments(name: str, level: Level) -> Segments:
+    """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
+    ball = level.ball() if isinstance(level, Quadric) else None
+    return Segments(name, ball or level)
+
+
 @dataclass(frozen=True)
 class Chain:
     """Discrete control barrier function h = -f:  (1 - alpha) h(x^tau) - h(x^{tau+1}) <= 0 (paper, section 5.1)."""
@@ -157,6 +172,8 @@ class Chain:
     name: str
     level: Level
     alpha: float
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
@@ -193,7 +210,7 @@ class Chain:
 
     def on_segments(self) -> "tuple[Part, ...]":
         """The chain, and its barrier on the segments where the waypoints' safety does not give it."""
-        return (self,) if self.level.convex else (self, Segments(self.name, self.level))
+        return (self,) if self.level.convex else (self, _segments(self.name, self.level))
 
 
 @dataclass(frozen=True)
@@ -208,6 +225,8 @@ class Opaque:
     fn: Callable[[Traj], Rows]
     count: Callable[[int], int]
     margin: float = 0.0
+
+    spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{i}" for i in range(self.count(horizon))]

@@ -84,6 +84,8 @@ class Reachable:
     weight: Tensor
     tolerance: float
 
+    spans = False  # between two states there is nothing to obey
+
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
 
@@ -122,7 +124,7 @@ class Reachable:
         return replace(self, tolerance=self.tolerance - margin)
 
     def segment_max(self, x: Traj) -> Rows:
-        """A step's own row: between two states there is nothing further to be safe from."""
+        """A step's own row."""
         return self(x)
 
     def on_segments(self) -> tuple[Part, ...]:
@@ -146,7 +148,7 @@ def fit(x: Array, u: Array, after: Array) -> tuple[LinearDynamics, float]:
     one in ten thousand of the usual step of each coordinate.
     """
     known = np.concatenate((x, u, np.ones((len(x), 1))), 1)
-    step = np.maximum(np.abs(after - x).mean(0), 1e-12)
+    step = np.maximum(np.abs(after - x).mean(0), 1e-9 * (1 + np.abs(x).max(0)))  # one that never moves has rounding alone
     kept = np.ones(len(x), dtype=bool)
     for _ in range(20):
         coefficients = np.linalg.lstsq(known[kept], after[kept], rcond=None)[0]
@@ -210,7 +212,7 @@ def nearest_reachable(
     if ends:
         u_base = u_base + (z[:, -1] - drift[:, -1]) @ f.S_e.T
     p_base, p_drift = u_base @ f.PG.T, drift[..., used]
-    u_shape, p_shape = (len(z), z.shape[1] - 1, -1), (len(z), z.shape[1], len(used))
+    u_shape, p_shape = (len(z), z.shape[1] - 1, len(dynamics.low)), (len(z), z.shape[1], len(used))
     w_u, y_u, w_p, y_p, u = warm or _cold(dynamics, z, used, copies)
     at = z[..., used]
     for k in range(rounds):
@@ -270,7 +272,7 @@ def _factor(
     for _ in range(steps):
         power.append(d.A @ power[-1])
         offset.append(d.A @ offset[-1] + d.c)
-    response = torch.stack([p @ d.B for p in power[:-1]])  # of x^{tau+1+k} to u^tau
+    response = (torch.stack(power) @ d.B)[:steps]  # of x^{tau+1+k} to u^tau
     G = torch.zeros(horizon, n, steps, m, dtype=torch.float64)
     for tau in range(1, horizon):
         G[tau, :, :tau] = response[:tau].flip(0).transpose(0, 1)

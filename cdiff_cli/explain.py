@@ -9,6 +9,7 @@ from rich.table import Table
 from cdiff_cli import figures
 from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
+from cdiff_cli.dynamics import Reachable
 from cdiff_cli.projection import has_exact_form
 from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.spec import load_constraints
@@ -41,7 +42,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             spec.describe(),
             str(len(part.labels(recipe.horizon))),
             ", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used),
-            "exact" if has_exact_form(part) else "sequential (ProxQP)",
+            "exact" if has_exact_form(part) else "ADMM" if isinstance(part, Reachable) else "sequential (ProxQP)",
             obey,
         )
     out.print(table)

@@ -103,6 +103,19 @@ class Quadric:
         end = (slope + curvature > 0).to(x0)  # the larger of both ends
         return torch.where(curvature < 0, (-slope / (2 * curvature)).clamp(0.0, 1.0), end)
 
+    def ball(self) -> "Ellipsoid | None":
+        """The same set as the outside of an ellipsoid along the coordinates, where it is one."""
+        own = self.P.diagonal() != 0
+        if not bool(own.any()) or bool((self.P.diagonal() > 0).any() | (self.P.diagonal().diag() != self.P).any()):
+            return None
+        weight = -self.P.diagonal()[own]
+        centre = self.q[own] / (2 * weight)
+        size = (weight * centre.square()).sum() - self.r  # f = size - sum_i weight_i (x_i - centre_i)^2
+        if bool((self.q[~own] != 0).any()) or bool(size <= 0):
+            return None
+        axes = (size / weight).sqrt()
+        return Ellipsoid(torch.eye(len(own)).to(axes)[own], centre, axes, axes.min(), 1)
+
 
 @dataclass(frozen=True)
 class Ellipsoid:

@@ -170,7 +170,11 @@ def _steps(x: Array, columns: Sequence[int]) -> Array:
 
 
 def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
-    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0."""
+    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, of dynamics those that no step leads to."""
     level = getattr(part, "level", None)
-    values = level(torch.from_numpy(x)) if level is not None else part(torch.from_numpy(x)).amax(1, keepdim=True)
+    values = part(torch.from_numpy(x)) if level is None else level(torch.from_numpy(x))
+    if not part.spans:
+        values = torch.nn.functional.pad(values, (1, 0), value=-torch.inf)
+    elif level is None:
+        values = values.amax(1, keepdim=True)
     return np.broadcast_to((values > SAFE).numpy(), x.shape[:2])

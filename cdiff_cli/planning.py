@@ -174,7 +174,7 @@ def plan(
 
 def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
     """Project finished plans in float64 onto the constraints tightened a little; also the largest displacement [n] and, where
-    dynamics were to be obeyed, the inputs: the plan is then what they produce, to the last bit.
+    dynamics were to be obeyed, the inputs: the plan is then what they produce, to rounding.
     """
     reachable = next(iter(dynamics_of(problem.enforced)), None)
     g = problem.enforced.tighten(MARGIN) if reachable is None else _tighten_others(problem.enforced, CLEARANCE)

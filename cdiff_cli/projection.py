@@ -6,13 +6,14 @@ half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one sca
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression (pooled adjacent violators)
 linear dynamics with bounded inputs, and any of these    ADMM on the inputs (dynamics.py), a local solution
-several other parts                                      Dykstra's algorithm over the exact forms
+several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -54,7 +55,6 @@ def _reach(
     part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int
 ) -> tuple[Traj, Warm | None]:
     """ADMM in environment units on the coordinates that the other parts constrain."""
-    others = [piece for other in others for piece in other.on_segments()]
     back = (-part.centre / part.scale, 1 / part.scale)
     used = _coordinates(others, z.shape[-1])
     narrow = [_restricted(other.pull_back(*back), used) for other in others]
@@ -106,16 +106,21 @@ def _project(g: Constraint, z: Traj, pins: Pins) -> Traj:
     _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
     if not g.parts or z.numel() == 0:
         return z
-    if all(tangible(part) for part in g.parts) and any(isinstance(part, Segments) for part in g.parts):
-        x = _around(cast(Any, g.parts), z, pins)
-        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
-            return x
+    sliding = any(isinstance(part, Segments) for part in g.parts)
+    around = cast(Any, [part for part in g.parts if sliding and tangible(part)])
+    others = [part for part in g.parts if not (sliding and tangible(part))]
     whole = bool((pins.mask.all(1) == pins.mask.any(1)).all())  # the exact forms move all of a waypoint or nothing of it
-    if whole and all(has_exact_form(part) for part in g.parts):
-        x = exact(g.parts[0], z, pins) if len(g.parts) == 1 else _dykstra(g, z, pins, tolerance)
+    begin = z
+    if (whole or not others) and all(has_exact_form(part) for part in others):
+        onto = [lambda y: _around(around, y, pins)] if around else []
+        onto += [partial(exact, part, pins=pins) for part in others]
+        x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
+        if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
+            x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
         if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
-    return _sequential(g, z, pins, tolerance)
+        begin = x if around else z  # near the set, on the side where the path passes
+    return _sequential(g, z, begin, pins, tolerance)
 
 
 def tangible(part: Part) -> bool:
@@ -155,22 +160,27 @@ def exact(part: Part, z: Traj, pins: Pins) -> Traj:
 # several at once, and anything else -----------------------------------------------------------------------------------
 
 
-def _dykstra(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> Traj:
-    """Dykstra's algorithm: the projection onto the intersection of convex sets; on others a heuristic that is checked."""
-    x, left = z, [torch.zeros_like(z) for _ in g.parts]
+def _dykstra(
+    g: Constraint, onto: Sequence[Callable[[Traj], Traj]], z: Traj, pins: Pins, tolerance: float, corrected: bool = True
+) -> Traj:
+    """Dykstra's algorithm over projections onto sets whose intersection is g: the projection onto it where they are convex; on
+    others a heuristic that is checked. Uncorrected it is plain alternation, which ends at some point of the intersection.
+    """
+    x, left = z, [torch.zeros_like(z) for _ in onto]
     for _ in range(ROUNDS):
         before = x
-        for i, part in enumerate(g.parts):
-            y = exact(part, x + left[i], pins)
-            left[i] = x + left[i] - y
+        for i, nearest_of in enumerate(onto):
+            y = nearest_of(x + left[i])
+            if corrected:
+                left[i] = x + left[i] - y
             x = y
         if float((x - before).abs().max()) <= tolerance / 10 and bool((_free_rows(g, x, pins) <= tolerance).all()):
             break
     return x
 
 
-def _sequential(g: Constraint, z: Traj, pins: Pins, tolerance: float, rounds: int = 50) -> Traj:
-    """Sequential linearisation, one plan after another: min |x - z|^2 s.t. g(x_k) + J(x_k) (x - x_k) <= 0."""
+def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float, rounds: int = 50) -> Traj:
+    """Sequential linearisation, one plan after another: min |x - z|^2 s.t. g(x_k) + J(x_k) (x - x_k) <= 0, from x_0 = begin."""
     import qpsolvers
     from scipy import sparse
 
@@ -179,7 +189,7 @@ def _sequential(g: Constraint, z: Traj, pins: Pins, tolerance: float, rounds: in
         free = ~pins.mask.flatten().cpu().numpy()
         target = z[b].double().cpu().numpy().ravel()
         matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
-        x = out[b : b + 1].double()
+        x = begin[b : b + 1].double()
         one = Pins(pins.mask, x)
         g64 = g.to(x)
         for _ in range(rounds):

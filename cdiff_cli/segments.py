@@ -46,17 +46,21 @@ def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
 
     Outside, n points to the segment's nearest point. Along a run of segments inside, from waypoint a to waypoint b, n turns
     from the direction of a by way of that of the run's nearest point to that of b, in proportion to the path walked.
+    On a line there is no way round: all normals point to the side that is nearer as a whole.
     """
     y = level.scaled(x)
+    pinned = pins.mask[:, level.which.argmax(1)].all(1)
+    if y.shape[-1] == 1:
+        return _one_side(y, pinned)
     first, last = y[:, :-1], y[:, 1:]
     s = level.worst(x[:, :-1], x[:, 1:])[..., None]
     near = first + s * (last - first)
     distance = near.norm(dim=-1)
     n = _unit(near, first)
-    inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-6)
+    inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-4)  # well above the rounding of a safe path
     if bool(inside.any()):
         n = torch.where(inside[..., None], _turning(y, near, distance, inside), n)
-    return _tangent_to_pins(n, y, pins.mask[:, level.which.argmax(1)].all(1))
+    return _tangent_to_pins(n, y, pinned)
 
 
 def nearest_in_planes(z: Traj, halfspaces: Planes, pins: Pins) -> Traj:
@@ -65,18 +69,17 @@ def nearest_in_planes(z: Traj, halfspaces: Planes, pins: Pins) -> Traj:
     """
     a, b = halfspaces
     value = (a * z[:, :, None]).sum(-1) - b
-    size = a.square().sum(-1)
     wrong = (value.amax(2) > 0) & ~pins.mask.any(1)
     if not bool(wrong.any()):
         return z
     out = z.clone()
-    out[wrong] = z[wrong] + _step(a[wrong], value[wrong], size[wrong])
+    out[wrong] = z[wrong] + _step(a[wrong].double(), value[wrong].double()).to(z)
     return out
 
 
-def _step(a: Tensor, value: Tensor, size: Tensor) -> Tensor:
+def _step(a: Tensor, value: Tensor) -> Tensor:
     """The shortest d with value + a.d <= 0, among those that make one row or two rows equal: [n, m, dim] -> [n, dim]."""
-    m = a.shape[1]
+    m, size = a.shape[1], a.square().sum(-1)
     i, j = torch.triu_indices(m, m, device=a.device)
     gram = torch.einsum("nid,njd->nij", a, a)[:, i, j]
     same = i == j
@@ -89,9 +92,16 @@ def _step(a: Tensor, value: Tensor, size: Tensor) -> Tensor:
     d = -(mu_i[..., None] * a[:, i] + mu_j[..., None] * a[:, j])  # [n, pairs, dim]
     excess = (value[:, None] + torch.einsum("npd,nid->npi", d, a)).clamp_min(0)
     missed = torch.where(usable, excess.amax(-1), torch.inf)
-    tolerance = 1e-9 if a.dtype == torch.float64 else 1e-5
-    cost = torch.where(missed <= tolerance, d.square().sum(-1), 1e12 * (1 + missed))
+    cost = torch.where(missed <= 1e-9, d.square().sum(-1), 1e12 * (1 + missed))
     return d[torch.arange(len(d), device=d.device), cost.argmin(1)]
+
+
+def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
+    """The normal of the whole path on a line: towards its pinned ends, else where it takes the shorter way [batch, n, 1]."""
+    below, above = ((1 + side * y).clamp_min(0).square().sum(1, keepdim=True) for side in (1, -1))
+    held = y[:, pinned].sum(1, keepdim=True)
+    up = torch.where(held == 0, above <= below, held > 0)
+    return (2 * up.to(y) - 1).expand(-1, y.shape[1] - 1, -1)
 
 
 def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tensor:
@@ -116,7 +126,7 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tenso
     e_mid = _unit(at(near, middle), at(_sideways(aside, across), middle))
     walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
     half = (walked[:, :-1] + walked[:, 1:]) / 2  # at the middle of each segment
-    begin, end = half.gather(1, run), half.gather(1, stop)
+    begin, end = walked.gather(1, run), walked.gather(1, stop + 1)
     share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
     to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
     angle = share * (to_mid + to_out)
@@ -156,8 +166,6 @@ def _unit(v: Tensor, instead: Tensor) -> Tensor:
 
 def _sideways(v: Tensor, along: Tensor) -> Tensor:
     """v, or where it is nearly zero some vector at right angles to `along`."""
-    if v.shape[-1] == 1:
-        return v
     turned = torch.zeros_like(along)
     turned[..., 0], turned[..., 1] = -along[..., 1], along[..., 0]
     flat = turned.norm(dim=-1, keepdim=True) < 1e-9  # along has neither: any first axis will do

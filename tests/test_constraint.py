@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from cdiff_cli.constraint import Chain, Constraint, Pins, Waypoints, pull_back, stack
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.levels import segment_max
+from cdiff_cli.levels import Quadric, segment_max
 from cdiff_cli.spec import Dcbf, Linear, Quadratic
-from tests.problems import F64, KINDS, LAYOUT, LEVELS, ball, chain, half_space, normal, pin, vec, waypoints
+from tests.problems import F64, KINDS, LAYOUT, LEVELS, ball, chain, ellipsoid, half_space, normal, num, pin, vec, waypoints
 
 seeds = st.integers(0, 10_000)
 quick = settings(max_examples=30, deadline=None)
@@ -185,3 +185,25 @@ def test_one_waypoint_has_a_segment_of_itself():
     x = normal(0, 2, 1, 2)
     assert torch.equal(Waypoints("w", half_space()).segment_max(x), half_space()(x))
     assert torch.equal(Chain("c", half_space(), 0.5).segment_max(x), half_space()(x))
+
+
+# quadrics that are ellipsoids -----------------------------------------------------------------------------------------
+
+
+def test_a_quadric_knows_the_ellipsoid_whose_outside_it_is():
+    for level in (ball(1), ball(1, centre=(0.4, -1.0, 2.0), radius=0.3, dim=5), ellipsoid(1)):
+        found = level.quadric().ball()
+        for name in ("which", "centre", "axes", "m"):
+            torch.testing.assert_close(getattr(found, name), getattr(level, name), atol=1e-12, rtol=0)
+        assert found.side == 1
+
+
+@pytest.mark.parametrize("name", ["inside ball squared", "general quadric"])
+def test_other_quadrics_are_no_ellipsoids_to_stay_outside_of(name):
+    assert LEVELS[name].ball() is None
+
+
+def test_a_quadric_that_excludes_nothing_or_leans_on_a_further_coordinate_is_no_ellipsoid():
+    P = torch.diag(vec(-1.0, 0.0))
+    assert Quadric(P, vec(0.0, 0.0), num(1.0)).ball() is None  # -x^2 <= 1 always
+    assert Quadric(P, vec(0.0, 1.0), num(-1.0)).ball() is None  # y <= x^2 - 1

@@ -305,7 +305,7 @@ def test_json_schema_knows_every_kind_and_refuses_further_fields():
     assert set(schema["required"]) == {"task", "constraints"}
     assert schema["additionalProperties"] is False
     mapping = schema["properties"]["constraints"]["items"]["discriminator"]["mapping"]
-    assert set(mapping) == {"linear", "quadratic", "dcbf"}
+    assert set(mapping) == {"linear", "quadratic", "dcbf", "dynamics"}
     for reference in mapping.values():
         kind = schema["$defs"][reference.removeprefix("#/$defs/")]
         assert kind["additionalProperties"] is False

@@ -1,0 +1,114 @@
+"""Plans under the checkpoint's linear dynamics: what the polish leaves, what is saved, what an execution makes of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from cdiff_cli.checkpoint import load_checkpoint, read_safetensors, save_checkpoint
+from cdiff_cli.dynamics import dynamics_of
+from cdiff_cli.errors import SpecError
+from cdiff_cli.experiment import plan_run
+from cdiff_cli.metrics import hits_wall
+from cdiff_cli.planning import CLEARANCE, follow, plan, polish_plans
+from cdiff_cli.recipe import home
+from cdiff_cli.request import Options, resolve
+from cdiff_cli.verify import verify_run
+
+DISC = {"name": "disc", "kind": "quadratic", "side": "outside", "centre": {"x": 1.0, "y": -0.2}, "radius": 0.2}
+FITTED = {"name": "ball", "kind": "dynamics", "fit": "demonstrations"}
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """The shipped checkpoint with the maze's own dynamics, p' = p + .00998 v + .00238 u, v' = .9976 v + .2382 u."""
+    shipped = load_checkpoint(home() / "models" / "maze2d-umaze" / "small.safetensors")
+    tensors, _ = read_safetensors(shipped.path, "")
+    eye, o, one = torch.eye(2).double(), torch.zeros(2, 2).double(), torch.ones(2).double()
+    A = torch.cat((torch.cat((eye, 0.0099762 * eye), 1), torch.cat((o, 0.99762 * eye), 1)))
+    B = torch.cat((0.0023816 * eye, 0.23816 * eye))
+    made = {"A": A, "B": B, "c": torch.zeros(4).double(), "low": -one, "high": one}
+    tensors |= {f"dynamics.{name}": value.contiguous() for name, value in made.items()}
+    path = tmp_path_factory.mktemp("checkpoint") / "small.safetensors"
+    return save_checkpoint(path, tensors, shipped.card.model_dump(mode="json")).path
+
+
+@pytest.fixture(scope="module")
+def constraints(tmp_path_factory):
+    path = tmp_path_factory.mktemp("constraints") / "own.yaml"
+    path.write_text(yaml.safe_dump({"task": "maze2d-umaze", "constraints": [DISC, FITTED]}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def resolved(checkpoint, constraints):
+    return resolve(Options(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints))
+
+
+@pytest.fixture(scope="module")
+def plans(resolved):
+    return plan(resolved.problem, resolved.method, resolved.seeds, kernel=resolved.kernel, polish=True)
+
+
+def test_a_polished_plan_is_what_its_inputs_produce_within_their_bounds(resolved, plans):
+    d = dynamics_of(resolved.problem.enforced)[0].dynamics
+    assert plans.u.shape == (2, 127, 2)
+    x = d.rollout(torch.from_numpy(plans.x[:, 0]), torch.from_numpy(plans.u)).numpy()
+    np.testing.assert_allclose(plans.x, x, atol=1e-12)
+    assert np.abs(plans.u).max() <= 1.0
+
+
+def test_a_polished_plan_is_safe_on_its_segments_and_reaches_the_goal(resolved, plans):
+    assert float(resolved.problem.enforced(torch.from_numpy(plans.x)).max()) <= 0.0
+    np.testing.assert_allclose(plans.x[:, 0], np.tile(resolved.problem.start, (2, 1)), atol=1e-12)
+    np.testing.assert_allclose(plans.x[:, -1], np.tile(resolved.problem.goal, (2, 1)), atol=CLEARANCE)
+
+
+def test_without_dynamics_there_are_no_inputs(resolved):
+    disc = replace(resolved.problem.enforced, parts=resolved.problem.enforced.parts[:1])
+    z = torch.zeros(1, 128, 4, dtype=torch.float64)
+    assert polish_plans(replace(resolved.problem, enforced=disc), z)[2] is None
+
+
+def test_planned_inputs_fed_forward_keep_the_execution_on_the_plan(resolved, plans):
+    """A millimetre where no wall is touched; what float32 forces and the simulator's own steps leave is far less."""
+    task = resolved.problem.task
+    assert not hits_wall(plans.x, [0, 1], task.walls()).any()
+    done = follow(task, plans.x, resolved.seeds, hold=5, planned=plans.u)
+    np.testing.assert_allclose(done.x[:, :128, :2], plans.x[..., :2], atol=1e-3)
+    assert done.success.all()
+    assert float(resolved.problem.g.parts[0](torch.from_numpy(done.x)).max()) <= 0.0
+
+
+def test_a_goal_out_of_reach_is_missed_in_the_plan_that_is_kept(resolved):
+    """From rest to 2 m away in 16 steps: the plan remains one that the inputs make, and its end is where they lead."""
+    problem = replace(resolved.problem, horizon=16)
+    z = torch.zeros(1, 16, 4, dtype=torch.float64)
+    x, _, u = polish_plans(problem, z)
+    x = problem.normaliser.decode(x).numpy()
+    assert np.isfinite(x).all()
+    assert np.abs(u).max() <= 1.0
+    assert np.linalg.norm(x[0, -1, :2] - problem.goal[:2]) > 1.0
+
+
+def test_a_run_with_fitted_dynamics_saves_its_inputs_and_is_verified_from_its_arrays(resolved, checkpoint, tmp_path, monkeypatch):
+    done = plan_run(resolved, tmp_path, lambda *_: None)
+    with np.load(done.path / "plan.npz") as arrays:
+        assert arrays["u"].shape == (2, 127, 2)
+    assert done.counts["safe_on_segments"] == 2
+    monkeypatch.setattr("cdiff_cli.checkpoint.load_checkpoint", None)  # nothing of it is needed
+    found = verify_run(done.path)
+    assert found.mismatch == ()
+    assert found.holds(waypoints_only=False)
+    assert {entry["constraint"] for entry in found.found["entries"]} == {"disc", "ball"}
+
+
+def test_fit_without_dynamics_in_the_checkpoint_is_refused_with_its_line(checkpoint, constraints, tmp_path):
+    tensors, _ = read_safetensors(checkpoint, "")
+    bare = {name: value for name, value in tensors.items() if not name.startswith("dynamics.")}
+    card = load_checkpoint(checkpoint).card.model_dump(mode="json")
+    path = save_checkpoint(tmp_path / "small.safetensors", bare, card).path
+    with pytest.raises(SpecError, match=r"own\.yaml:\d+ constraints\[1\]\.fit: the checkpoint has no linear dynamics"):
+        resolve(Options(checkpoint=path, constraints=constraints))
