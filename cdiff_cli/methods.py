@@ -25,7 +25,10 @@ Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
 Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
-DYNAMICS_FROM = 0.995  # chosen on maze2d-{umaze,large}-{disc,slalom}, seed 2000: equally safe executed, the smallest distance of 0, .9, .95, .995
+DYNAMICS_FROM = 0.995
+"""Of 0, 0.9, 0.95 and 0.995 the one with the smallest distance, all as safe when executed: alm on maze2d-umaze-disc and -slalom,
+100 random pairs, seed 2000.
+"""
 
 
 @dataclass(frozen=True)
