@@ -176,9 +176,14 @@ class Warm(NamedTuple):
     y_p: Tensor
     u: Tensor
 
+    def of(self, which: Tensor) -> "Warm":
+        """Of some trajectories of the batch alone."""
+        return Warm(self.w_u[which], self.y_u[which], self.w_p[:, which], self.y_p[:, which], self.u[which])
+
 
 RHO_U, RHO_P = 0.02, 5.0  # weights of the copies of u and of positions
 RELAXATION = 1.6
+TURNS = (0, 10, 20, 40)  # rounds before which the tangent planes (segments.py) are chosen anew; then they rest, to converge
 
 
 def nearest_reachable(
@@ -193,7 +198,6 @@ def nearest_reachable(
     rounds: int,
     warm: Warm | None = None,
     tolerance: float = 0.0,
-    turn_every: int = 10,
 ) -> tuple[Traj, Warm]:
     """The trajectory nearest to z, |x - z|^2 weighted by coordinate, that the dynamics produce from the first state of z under
     bounded inputs, with the parts (affine at waypoints, balls on segments) obeyed and a pinned last state reached.
@@ -201,7 +205,6 @@ def nearest_reachable(
     parts, rest  act on the coordinates `used` alone; rest is the projection onto whatever else is to hold, or None
     weight      of each coordinate in the distance   [n]
     rounds      of ADMM at most; it stops where every copy is within `tolerance` of the trajectory
-    turn_every  rounds between new choices of the tangent planes (segments.py)
     """
     used, ends = tuple(used), bool(pins.mask[-1].all())
     copies = (len(parts) > 0) + (rest is not None)
@@ -216,7 +219,7 @@ def nearest_reachable(
     w_u, y_u, w_p, y_p, u = warm or _cold(dynamics, z, used, copies)
     at = z[..., used]
     for k in range(rounds):
-        if k % turn_every == 0 and parts:
+        if parts and k in TURNS:
             halfspaces = planes(parts, at, held)
         push = (w_p - y_p).sum(0) - copies * p_drift
         pushes = torch.cat((RHO_U * (w_u - y_u).flatten(1), RHO_P * push.flatten(1)), 1)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from cdiff_cli.constraint import Constraint, Pins, Traj, pull_back
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step, sample
-from cdiff_cli.dynamics import Reachable, dynamics_of
+from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
-from cdiff_cli.projection import POLISH_ROUNDS, project_from
+from cdiff_cli.projection import ADMM_ROUNDS, project_from
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -113,7 +113,8 @@ def plan(
     device, dim = problem.device, len(problem.task.layout)
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
-    g = pull_back(problem.enforced, centre, scale).to(like)
+    inside = _tighten_others(problem.enforced, CLEARANCE) if dynamics_of(problem.enforced) else problem.enforced
+    g = pull_back(inside, centre, scale).to(like)
     pins = make_pins(problem, len(seeds))
     shape = (problem.horizon, dim)
     total = problem.schedule.n_steps + extra_steps
@@ -176,19 +177,38 @@ def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
     """Project finished plans in float64 onto the constraints tightened a little; also the largest displacement [n] and, where
     dynamics were to be obeyed, the inputs: the plan is then what they produce, to rounding.
     """
-    reachable = next(iter(dynamics_of(problem.enforced)), None)
-    g = problem.enforced.tighten(MARGIN) if reachable is None else _tighten_others(problem.enforced, CLEARANCE)
-    g = pull_back(g, problem.normaliser.centre, problem.normaliser.scale)
     pins = make_pins(problem, len(z), torch.float64, torch.device("cpu"))
-    out, warm = project_from(g, z, pins, None, POLISH_ROUNDS)
     inputs = None
-    if reachable is not None and warm is not None:
-        u = torch.clamp(warm.u, reachable.dynamics.low, reachable.dynamics.high)
-        out = problem.normaliser.encode(reachable.dynamics.rollout(problem.normaliser.decode(out[:, 0]), u))
-        inputs = u.numpy()
+    if dynamics_of(problem.enforced):
+        out, inputs = _follow_dynamics(problem, z, pins)
+    else:
+        g = pull_back(problem.enforced.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
+        out = project_from(g, z, pins, None, 0)[0]
     columns = [problem.task.layout.index(name) for name in problem.task.positions]
     shift = (problem.normaliser.scale * (out - z))[..., columns].norm(dim=-1).amax(1)
     return out, shift.numpy(), inputs
+
+
+def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array]:
+    """Plans near z that the dynamics make, and their inputs: solved as finely as it takes for the rollout of the inputs to be safe
+    and to end within a millimetre of the pinned state.
+    """
+    (reachable,) = dynamics_of(problem.enforced)
+    scale, dynamics = problem.normaliser, reachable.dynamics
+    g = pull_back(_tighten_others(problem.enforced, CLEARANCE), scale.centre, scale.scale)
+    todo, warm = torch.arange(len(z)), None
+    x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
+    for tolerance in (5e-4, 5e-5, 5e-6):
+        near, warm = project_from(g, z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
+        assert warm is not None
+        u[todo] = torch.clamp(warm.u, dynamics.low, dynamics.high)
+        x[todo] = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), u[todo]))
+        missed = (scale.scale * torch.where(pins.mask, x[todo] - pins.values[todo], 0.0)).abs().amax((1, 2)) > 1e-3
+        unsafe = (split(problem.enforced)[0](scale.decode(x[todo])) > 0).any(1)
+        if not bool((missed | unsafe).any()):
+            break
+        warm, todo = warm.of(missed | unsafe), todo[missed | unsafe]
+    return x, u.numpy()
 
 
 def _tighten_others(g: Constraint, margin: float) -> Constraint:

@@ -28,7 +28,7 @@ from cdiff_cli.levels import Affine, Ellipsoid, Quadric
 from cdiff_cli.segments import nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
-POLISH_ROUNDS = 600  # of ADMM at most, where no number is given
+ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
 ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 
 
@@ -38,21 +38,27 @@ def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
     Convex parts with a closed form: the global nearest point. Non-convex intersections: a feasible local one. Raises
     InfeasibleError, naming rows, where none was found.
     """
-    return project_from(g, z, pins, None, POLISH_ROUNDS)[0]
+    return project_from(g, z, pins, None, ADMM_ROUNDS, 1e-6)[0]
 
 
-def project_from(g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int) -> tuple[Traj, Warm | None]:
-    """The same, where dynamics are to be obeyed in that many rounds of ADMM from where the last call ended."""
+def project_from(
+    g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float = 1e-3
+) -> tuple[Traj, Warm | None]:
+    """The same, where dynamics are to be obeyed in that many rounds of ADMM, or as many as bring its copies within the
+    tolerance (units of the inputs, and environment units), from where the last call ended.
+    """
     reachable = dynamics_of(g)
     if not reachable:
         return _project(g, z, pins), None
     if len(reachable) > 1:
         raise InfeasibleError(f'two sets of dynamics, "{reachable[0].name}" and "{reachable[1].name}": a plan can obey only one')
-    return _reach(reachable[0], [part for part in g.parts if part is not reachable[0]], pins.paint(z), pins, warm, rounds)
+    return _reach(
+        reachable[0], [part for part in g.parts if part is not reachable[0]], pins.paint(z), pins, warm, rounds, tolerance
+    )
 
 
 def _reach(
-    part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int
+    part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float
 ) -> tuple[Traj, Warm | None]:
     """ADMM in environment units on the coordinates that the other parts constrain."""
     back = (-part.centre / part.scale, 1 / part.scale)
@@ -60,7 +66,6 @@ def _reach(
     narrow = [_restricted(other.pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
     rest = Constraint(tuple(other for other in narrow if not tangible(other)))
-    tolerance = 1e-7 if z.dtype == torch.float64 else 1e-3
     x, warm = nearest_reachable(
         part.dynamics,
         around,
@@ -135,10 +140,16 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
     """Projection onto the half-spaces of tangent planes, chosen anew at each result: the set so described holds the last result,
     so the distance to z can only fall.
     """
-    x = z
+    touched = (Constraint(tuple(parts))(z) > 0).any(1)
+    if not bool(touched.any()):
+        return z
+    some, held = z[touched], Pins(pins.mask, pins.values[touched])
+    x = some
     for _ in range(REFINEMENTS):
-        x = nearest_in_planes(z, planes(parts, x, pins), pins)
-    return x
+        x = nearest_in_planes(some, planes(parts, x, held), held)
+    out = z.clone()
+    out[touched] = x
+    return out
 
 
 def has_exact_form(part: Part) -> bool:
