@@ -24,7 +24,7 @@ from cdiff_cli.segments import nearest_in_planes, planes
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class LinearDynamics:
     """x' = A x + B u + c with low <= u <= high.
 
@@ -208,7 +208,8 @@ def nearest_reachable(
     """
     used, ends = tuple(used), bool(pins.mask[-1].all())
     copies = (len(parts) > 0) + (rest is not None)
-    f = _factor(dynamics, z.shape[1], used, copies, ends, tuple(weight.tolist()))
+    numbers = tuple(tuple(v.flatten().tolist()) for v in (dynamics.A, dynamics.B, dynamics.c))
+    f = _factor(numbers, z.shape[1], used, copies, ends, tuple(weight.tolist()), z.dtype, z.device)
     held = Pins(pins.mask[:, used], z[..., used])
     drift = (z[:, 0] @ f.F.T + f.offset).reshape(z.shape)  # where no input leads
     u_base = ((z - drift) * weight).flatten(1) @ f.G @ f.S.T
@@ -265,17 +266,25 @@ class _Factor(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _factor(
-    dynamics: LinearDynamics, horizon: int, used: tuple[int, ...], copies: int, ends: bool, weight: tuple[float, ...]
+    numbers: tuple[tuple[float, ...], ...],
+    horizon: int,
+    used: tuple[int, ...],
+    copies: int,
+    ends: bool,
+    weight: tuple[float, ...],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> _Factor:
-    d = dynamics.to(torch.empty(0, dtype=torch.float64))
-    n, m = d.B.shape
-    steps = horizon - 1
+    n, steps = len(weight), horizon - 1
+    A, B, c = (torch.tensor(values, dtype=torch.float64) for values in numbers)
+    A, B = A.reshape(n, n), B.reshape(n, -1)
+    m = B.shape[1]
     power = [torch.eye(n, dtype=torch.float64)]
     offset = [torch.zeros(n, dtype=torch.float64)]
     for _ in range(steps):
-        power.append(d.A @ power[-1])
-        offset.append(d.A @ offset[-1] + d.c)
-    response = (torch.stack(power) @ d.B)[:steps]  # of x^{tau+1+k} to u^tau
+        power.append(A @ power[-1])
+        offset.append(A @ offset[-1] + c)
+    response = (torch.stack(power) @ B)[:steps]  # of x^{tau+1+k} to u^tau
     G = torch.zeros(horizon, n, steps, m, dtype=torch.float64)
     for tau in range(1, horizon):
         G[tau, :, :tau] = response[:tau].flip(0).transpose(0, 1)
@@ -291,4 +300,4 @@ def _factor(
         S = S - S_e @ last @ S
     K_u = torch.cat((S, S @ PG.T), 1)
     made = (torch.cat(power), torch.cat(offset), flat, PG, S, S_e, K_u, PG @ K_u)
-    return _Factor(*(v.to(dynamics.A) for v in made))
+    return _Factor(*(v.to(device, dtype) for v in made))
