@@ -41,6 +41,7 @@ Count = Annotated[int, typer.Option("--n", "--episodes", help="number of plans, 
 Seed = Annotated[int, typer.Option("--seed", help="first seed; plans use seed, seed + 1, ...")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda")]
 Random = Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each plan")]
+NoDynamics = Annotated[bool, typer.Option("--no-dynamics", help="do not obey the fitted dynamics, whatever the preset says")]
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object instead of the table")]
 RunsFolder = Annotated[Path, typer.Option("--runs", help="where runs are kept")]
 
@@ -210,6 +211,7 @@ def plan(
     start: Start = None,
     goal: Goal = None,
     random: Random = False,
+    no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
     settings: Settings = None,
@@ -243,6 +245,7 @@ def rollout(
     start: Start = None,
     goal: Goal = None,
     random: Random = False,
+    no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
     settings: Settings = None,

@@ -46,6 +46,7 @@ class Options:
     seed: int = 0
     device: str = "auto"
     random: bool = False
+    no_dynamics: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,15 @@ class Resolved:
             "task": self.options.task,
             "constraints": self.constraints_path.stem,
             "method": self.options.method,
-            "preset": self.options.preset + ("*" if self.options.settings or self.options.kernel or self.options.steps else ""),
+            "preset": self.options.preset + ("*" if self._changed() else ""),
             "on": self.settings.get("on", ""),
             "kernel": self.kernel,
         }
+
+    def _changed(self) -> bool:
+        """Whether an option departs from the preset."""
+        asked = self.options
+        return bool(asked.settings or asked.kernel or asked.steps or asked.no_dynamics)
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
@@ -150,7 +156,7 @@ def resolve(options: Options) -> Resolved:
         if checkpoint is None or not hasattr(task, "random_point"):
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
-    obeyed = _obeyed(kinds, g, preset, task, checkpoint)
+    obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
     problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
     check_feasible(problem)
     return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)

@@ -79,6 +79,16 @@ def test_plans_begin_and_end_where_asked(alm_run):
         )  # what the dynamics make
 
 
+def test_without_dynamics_no_inputs_are_planned_and_the_preset_is_marked_as_changed(alm_run, tmp_path):
+    with np.load(alm_run[0] / "plan.npz") as plan:
+        assert plan["u"].shape == (2, 127, 2)
+    cdiff("plan", "--method", "alm", "--n", 1, "--no-dynamics", "--runs", tmp_path)
+    (run,) = tmp_path.iterdir()
+    with np.load(run / "plan.npz") as plan:
+        assert "u" not in plan
+    assert ",recommended*," in (run / "rows.csv").read_text()
+
+
 def test_equal_seeds_give_equal_plans(alm_run, tmp_path):
     run, _ = alm_run
     cdiff("plan", "--method", "alm", "--n", 2, "--runs", tmp_path)
