@@ -15,7 +15,7 @@ from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step
 from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
-from cdiff_cli.projection import ADMM_ROUNDS, project_from
+from cdiff_cli.projection import ADMM_ROUNDS, project, project_from
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -183,7 +183,7 @@ def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
         out, inputs = _follow_dynamics(problem, z, pins)
     else:
         g = pull_back(problem.enforced.tighten(MARGIN), problem.normaliser.centre, problem.normaliser.scale)
-        out = project_from(g, z, pins, None, 0)[0]
+        out = project(g, z, pins)
     columns = [problem.task.layout.index(name) for name in problem.task.positions]
     shift = (problem.normaliser.scale * (out - z))[..., columns].norm(dim=-1).amax(1)
     return out, shift.numpy(), inputs

@@ -38,18 +38,21 @@ def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
     Convex parts with a closed form: the global nearest point. Non-convex intersections: a feasible local one. Raises
     InfeasibleError, naming rows, where none was found.
     """
-    return project_from(g, z, pins, None, ADMM_ROUNDS, 1e-6)[0]
+    return project_from(g, z, pins, None, ADMM_ROUNDS, 1e-6, strict=True)[0]
 
 
 def project_from(
-    g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float = 1e-3
+    g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float = 1e-3, strict: bool = False
 ) -> tuple[Traj, Warm | None]:
     """The same, where dynamics are to be obeyed in that many rounds of ADMM, or as many as bring its copies within the
     tolerance (units of the inputs, and environment units), from where the last call ended.
+
+    strict   raise where nothing feasible was found; otherwise, as within sampling, where the next estimate may be easier, return
+             the best point that the tangent planes of segments gave
     """
     reachable = dynamics_of(g)
     if not reachable:
-        return _project(g, z, pins), None
+        return _project(g, z, pins, strict), None
     if len(reachable) > 1:
         raise InfeasibleError(f'two sets of dynamics, "{reachable[0].name}" and "{reachable[1].name}": a plan can obey only one')
     return _reach(
@@ -69,7 +72,7 @@ def _reach(
     x, warm = nearest_reachable(
         part.dynamics,
         around,
-        (lambda p, held: _project(rest, p, held)) if rest.parts else None,
+        (lambda p, held: _project(rest, p, held, False)) if rest.parts else None,
         part.decode(z),
         Pins(pins.mask, part.decode(pins.values)),
         used=used,
@@ -105,10 +108,11 @@ def _restricted(part: Part, used: Sequence[int]) -> Part:
     return part
 
 
-def _project(g: Constraint, z: Traj, pins: Pins) -> Traj:
+def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     z = pins.paint(z)
     tolerance = 1e-9 if z.dtype == torch.float64 else 2e-6
-    _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
+    if strict:
+        _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
     if not g.parts or z.numel() == 0:
         return z
     sliding = any(isinstance(part, Segments) for part in g.parts)
@@ -122,7 +126,8 @@ def _project(g: Constraint, z: Traj, pins: Pins) -> Traj:
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
             x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
-        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
+        contradicts = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
+        if not contradicts or (around and not strict):
             return x
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)

@@ -8,9 +8,12 @@ import torch
 import yaml
 
 from cdiff_cli.checkpoint import load_checkpoint, read_safetensors, save_checkpoint
+from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.dynamics import dynamics_of
 from cdiff_cli.errors import SpecError
 from cdiff_cli.experiment import plan_run
+from cdiff_cli.levels import Affine
+from cdiff_cli.methods import Projected, make_method
 from cdiff_cli.metrics import hits_wall
 from cdiff_cli.planning import CLEARANCE, follow, plan, polish_plans
 from cdiff_cli.recipe import home
@@ -112,3 +115,14 @@ def test_fit_without_dynamics_in_the_checkpoint_is_refused_with_its_line(checkpo
     path = save_checkpoint(tmp_path / "small.safetensors", bare, card).path
     with pytest.raises(SpecError, match=r"own\.yaml:\d+ constraints\[1\]\.fit: the checkpoint has no linear dynamics"):
         resolve(Options(checkpoint=path, constraints=constraints))
+
+
+def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolved):
+    """The goal obeys the constraint by a millimetre, less than what plans keep while they are made."""
+    ceiling = torch.tensor(resolved.problem.goal[1] + 1e-3, dtype=torch.float64)
+    level = Affine(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling)
+    g = Constraint((Waypoints("near", level),))
+    problem = replace(resolved.problem, g=g, enforced=Constraint((*g.parts, *dynamics_of(resolved.problem.enforced))))
+    for method in (Projected(), make_method("alm", {})):
+        plans = plan(problem, method, [0], polish=True)
+        assert np.abs(plans.x[0, -1] - problem.goal).max() < 1e-3
