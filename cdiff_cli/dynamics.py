@@ -40,11 +40,6 @@ class LinearDynamics:
     def __call__(self, x: Tensor, u: Tensor) -> Tensor:
         return x @ self.A.T + u @ self.B.T + self.c
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "LinearDynamics":
-        """The same dynamics of z, x = centre + scale * z; the inputs keep their units."""
-        c = (self.A @ centre + self.c - centre) / scale
-        return replace(self, A=self.A * scale / scale[:, None], B=self.B / scale[:, None], c=c)
-
     def to(self, like: Tensor) -> "LinearDynamics":
         return LinearDynamics(*(v.to(like) for v in (self.A, self.B, self.c, self.low, self.high)))
 
