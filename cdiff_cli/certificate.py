@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint, Part
 from cdiff_cli.levels import Level
-from cdiff_cli.metrics import between
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -139,7 +138,7 @@ def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
     """
     level: Level | None = getattr(part, "level", None)
     exact = level is not None or not part.spans
-    rows = _values(between(part, _tensor(x)))
+    rows = _values(part.segment_max(_tensor(x)))
     at = [_first_worst(values) for values in rows]
     if level is None or any(segment is None for segment in at):
         places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)

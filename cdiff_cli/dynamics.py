@@ -81,6 +81,12 @@ class Reachable:
 
     spans = False  # between two states there is nothing to obey
 
+    @classmethod
+    def of(cls, name: str, dynamics: LinearDynamics, tolerance: float) -> "Reachable":
+        """Of trajectories in environment units, every coordinate weighing 1."""
+        one = torch.ones_like(dynamics.c)
+        return cls(name, dynamics, torch.zeros_like(one), one, one, tolerance)
+
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
 

@@ -46,8 +46,8 @@ class Unconstrained:
 class Projected:
     """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean.
 
-    correction   on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
-                 x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
+    correction     on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
+                   x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
     rounds         of ADMM a step where dynamics are to be obeyed, from where the step before ended; other projections are exact
     dynamics_from  they are obeyed once sqrt(alpha_bar_{t-1}) is at least this
     """

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cdiff_cli.constraint import Constraint, Part
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.tasks import Task
 
@@ -30,17 +30,8 @@ def worst_waypoint(g: Constraint, x: Array) -> Array:
 
 def worst_segment(g: Constraint, x: Array) -> Array:
     """Largest g on the straight segments between waypoints [n], exact for half-spaces, quadrics, balls and ellipsoids."""
-    each = [between(part, torch.from_numpy(x)) for part in g.parts]
+    each = [part.segment_max(torch.from_numpy(x)) for part in g.parts]
     return _largest(torch.cat(each, 1) if each else torch.empty(len(x), 0, dtype=torch.float64)).numpy()
-
-
-def between(part: Part, x: torch.Tensor) -> torch.Tensor:
-    """Largest value of one part on each segment; rounding never puts it below the values at the segment's two ends."""
-    largest, level = part.segment_max(x), getattr(part, "level", None)
-    if level is None or x.shape[1] < 2:
-        return largest
-    ends = level(x)
-    return torch.maximum(largest, torch.maximum(ends[:, :-1], ends[:, 1:]))
 
 
 def distance(x: Array, x_free: Array, columns: Sequence[int], power: float = 1.0) -> Array:

@@ -22,14 +22,14 @@ from torch import Tensor
 
 from cdiff_cli.closed_forms import nearest, nearest_on_chain
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
-from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable
+from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
 from cdiff_cli.segments import nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
-ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 
 
 def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
@@ -55,9 +55,7 @@ def project_from(
         return _project(g, z, pins, strict), None
     if len(reachable) > 1:
         raise InfeasibleError(f'two sets of dynamics, "{reachable[0].name}" and "{reachable[1].name}": a plan can obey only one')
-    return _reach(
-        reachable[0], [part for part in g.parts if part is not reachable[0]], pins.paint(z), pins, warm, rounds, tolerance
-    )
+    return _reach(reachable[0], split(g)[0].parts, pins.paint(z), pins, warm, rounds, tolerance)
 
 
 def _reach(
@@ -126,8 +124,8 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
             x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
-        contradicts = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
-        if not contradicts or (around and not strict):
+        missed = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
+        if not missed or (around and not strict):
             return x
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
@@ -183,7 +181,7 @@ def _dykstra(
     others a heuristic that is checked. Uncorrected it is plain alternation, which ends at some point of the intersection.
     """
     x, left = z, [torch.zeros_like(z) for _ in onto]
-    for _ in range(ROUNDS):
+    for _ in range(DYKSTRA_ROUNDS):
         before = x
         for i, nearest_of in enumerate(onto):
             y = nearest_of(x + left[i])

@@ -105,7 +105,7 @@ class Recipe(Strict):
 class Card(Strict):
     """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
 
-    linear   share of the data's transitions that the checkpoint's linear dynamics explain; None where none were fitted
+    linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
     task: str

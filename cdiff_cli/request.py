@@ -19,7 +19,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
-from cdiff_cli.spec import Dynamics, Kind, enforced, load_constraints
+from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
 from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
 
@@ -167,7 +167,7 @@ def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, ch
     parts = enforced(kinds, g, preset.safety).parts
     dynamics = checkpoint.dynamics if checkpoint else None
     if preset.dynamics and dynamics is not None and not dynamics_of(g):
-        parts = (*parts, Dynamics.of(dynamics, task.layout).compile(task.layout))
+        parts = (*parts, Reachable.of("dynamics", dynamics, DYNAMICS_TOLERANCE))
     weight = torch.tensor([VELOCITY_WEIGHT if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
     return Constraint(tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts))
 

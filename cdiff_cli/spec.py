@@ -23,6 +23,7 @@ PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
 Coordinates = Annotated[dict[str, Number], Field(min_length=1)]
 Location = tuple[str | int, ...]
 Layout = Sequence[str]
+DYNAMICS_TOLERANCE = 1e-5  # of a step against the dynamics, environment units: the rounding of float32 plans
 Safety = Annotated[
     Literal["waypoints", "segments"] | None,
     Field(description="where it must hold: at waypoints, or all along the straight segments between them; default: the preset's"),
@@ -158,7 +159,7 @@ class Dynamics(Strict):
     B: Annotated[dict[str, Coordinates] | None, Field(description="row by coordinate x', column by input")] = None
     c: Coordinates | None = None
     inputs: Annotated[dict[str, tuple[Number, Number]] | None, Field(description="lowest and highest value of each input")] = None
-    tolerance: Annotated[PositiveNumber, Field(description="of the largest step that is missed, environment units")] = 1e-5
+    tolerance: Annotated[PositiveNumber, Field(description="of the largest miss of a step, its own units")] = DYNAMICS_TOLERANCE
 
     @model_validator(mode="after")
     def _given_or_fitted(self) -> "Dynamics":
@@ -177,7 +178,7 @@ class Dynamics(Strict):
         return self
 
     @classmethod
-    def of(cls, dynamics: LinearDynamics, layout: Layout, name: str = "dynamics", tolerance: float = 1e-5) -> "Dynamics":
+    def of(cls, dynamics: LinearDynamics, layout: Layout, name: str, tolerance: float = DYNAMICS_TOLERANCE) -> "Dynamics":
         """The kind that gives these dynamics."""
         inputs = [f"u{i}" for i in range(dynamics.B.shape[1])]
         return cls(
@@ -209,9 +210,7 @@ class Dynamics(Strict):
             low=low,
             high=high,
         )
-        n = len(layout)
-        one = torch.ones(n, dtype=torch.float64)
-        return Reachable(self.name, dynamics, torch.zeros_like(one), one, one, self.tolerance)
+        return Reachable.of(self.name, dynamics, self.tolerance)
 
     def describe(self) -> str:
         if self.fit:

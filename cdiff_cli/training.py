@@ -23,6 +23,7 @@ from cdiff_cli.recipe import Recipe, TrainSpec, shown
 from cdiff_cli.tasks import Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
+LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def train(
     tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()}
     tensors |= {"normaliser.centre": normaliser.centre, "normaliser.scale": normaliser.scale}
     tensors |= {"demonstrations": normaliser.decode(sample).float()}
-    if dynamics is not None:
+    if dynamics is not None and dynamics[1] >= LINEAR:
         tensors |= {f"dynamics.{name}": value for name, value in vars(dynamics[0]).items()}
     return save_checkpoint(work / "model.safetensors", tensors, card)
 

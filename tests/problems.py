@@ -3,12 +3,16 @@
 import math
 
 import numpy as np
+import pytest
 import qpsolvers
 import torch
 
 from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints
 from cdiff_cli.diffusion import Step
+from cdiff_cli.errors import SpecError
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
+from cdiff_cli.projection import project
+from cdiff_cli.spec import load_constraints
 
 LAYOUT = ("x", "y", "vx", "vy")
 F64 = torch.float64
@@ -151,3 +155,28 @@ def draws(seed, *shape):
     """A noise source of one generator, float64."""
     rng = generator(seed)
     return lambda: torch.randn(*shape, generator=rng, dtype=F64)
+
+
+QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupled ones with alpha = 1e-3 cost digits
+
+
+def free_projection(g, z):
+    """Projection with nothing pinned."""
+    return project(g, z, Pins.none(z))
+
+
+def qp_projection(g, z, pins=None):
+    """The nearest trajectories by ProxQP, for affine rows."""
+    fixed = None if pins is None else pins.mask.flatten().numpy()
+    out = []
+    for one in z:
+        J, offset = dense_jacobian(g, one[None])
+        out.append(qp_project(J, -offset, one.flatten().numpy(), fixed).reshape(one.shape))
+    return torch.from_numpy(np.stack(out))
+
+
+def refused_at(path, start):
+    """Loading the constraint file ends with an error that names the file and begins `start` after it: line, field, complaint."""
+    with pytest.raises(SpecError) as caught:
+        load_constraints(path, "maze2d-umaze", ("x", "y", "vx", "vy"))
+    assert str(caught.value).startswith(f"{path}:{start}"), str(caught.value)

@@ -1,6 +1,5 @@
 """Projections: known answers, agreement with a QP solver and with brute force, idempotence, pins."""
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -14,16 +13,17 @@ from tests.problems import (
     F64,
     KINDS,
     LEVELS,
+    QP,
     ball,
     chain,
-    dense_jacobian,
     ellipsoid,
+    free_projection,
     half_space,
     nearest_of,
     normal,
     num,
     pin,
-    qp_project,
+    qp_projection,
     saddle,
     vec,
     waypoints,
@@ -31,30 +31,15 @@ from tests.problems import (
 
 seeds = st.integers(0, 10_000)
 quick = settings(max_examples=30, deadline=None)
-QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupled ones with alpha = 1e-3 cost digits
 CONVEX = ["half-space", "inside ball", "inside ball squared", "inside ellipsoid", "dcbf over half-space"]
 EXACT = [*CONVEX, "outside ball", "outside ball squared", "outside ellipsoid", "general quadric", "dcbf over outside ball"]
-
-
-def _free(g, z):
-    return project(g, z, Pins.none(z))
-
-
-def _qp(g, z, pins=None):
-    """The nearest trajectories by ProxQP, for affine rows."""
-    fixed = None if pins is None else pins.mask.flatten().numpy()
-    out = []
-    for one in z:
-        J, offset = dense_jacobian(g, one[None])
-        out.append(qp_project(J, -offset, one.flatten().numpy(), fixed).reshape(one.shape))
-    return torch.from_numpy(np.stack(out))
 
 
 # known answers --------------------------------------------------------------------------------------------------------
 
 
 def test_half_space_moves_along_its_normal():
-    x = _free(waypoints(Affine(vec(3.0, 4.0), num(0.0))), vec(3.0, 4.0).reshape(1, 1, 2))
+    x = free_projection(waypoints(Affine(vec(3.0, 4.0), num(0.0))), vec(3.0, 4.0).reshape(1, 1, 2))
     torch.testing.assert_close(x.flatten(), vec(0.0, 0.0), atol=1e-15, rtol=0)  # rounding
 
 
@@ -69,37 +54,37 @@ def test_half_space_moves_along_its_normal():
     ],
 )
 def test_ball_moves_radially_to_its_sphere(side, start, end):
-    x = _free(waypoints(ball(side, centre=(0.0, 0.0), radius=2.0)), vec(*start).reshape(1, 1, 2))
+    x = free_projection(waypoints(ball(side, centre=(0.0, 0.0), radius=2.0)), vec(*start).reshape(1, 1, 2))
     torch.testing.assert_close(x.flatten(), vec(*end), atol=1e-14, rtol=0)  # rounding
 
 
 def test_ball_leaves_coordinates_it_does_not_name():
     level = Ellipsoid(torch.eye(2, 4, dtype=F64), vec(0.0, 0.0), vec(1.0, 1.0), num(1.0), 1)
-    x = _free(waypoints(level), vec(0.5, 0.0, 7.0, -7.0).reshape(1, 1, 4))
+    x = free_projection(waypoints(level), vec(0.5, 0.0, 7.0, -7.0).reshape(1, 1, 4))
     torch.testing.assert_close(x.flatten(), vec(1.0, 0.0, 7.0, -7.0), atol=1e-15, rtol=0)
 
 
 def test_centre_of_an_ellipsoid_leaves_along_its_short_axis():
-    x = _free(waypoints(ellipsoid(1, centre=(0.0, 0.0), axes=(3.0, 1.0))), torch.zeros(1, 1, 2, dtype=F64))
+    x = free_projection(waypoints(ellipsoid(1, centre=(0.0, 0.0), axes=(3.0, 1.0))), torch.zeros(1, 1, 2, dtype=F64))
     torch.testing.assert_close(x.abs().flatten(), vec(0.0, 1.0), atol=2e-6, rtol=0)  # a stationary point is stepped off by 1e-6
 
 
 def test_quadric_of_deficient_rank_leaves_the_other_coordinates():
     level = Quadric(torch.diag(vec(0.0, 1.0, 2.0)), vec(0.0, 0.0, 0.0), num(1.0))
-    x = _free(waypoints(level), vec(5.0, 3.0, 0.0).reshape(1, 1, 3))
+    x = free_projection(waypoints(level), vec(5.0, 3.0, 0.0).reshape(1, 1, 3))
     torch.testing.assert_close(x.flatten(), vec(5.0, 1.0, 0.0), atol=1e-9, rtol=0)  # bisection to float64's resolution
 
 
 def test_rotated_quadric_of_deficient_rank_leaves_its_null_direction():
     turn = torch.linalg.qr(normal(3, 3, 3)).Q
     level = Quadric(turn @ torch.diag(vec(0.0, 0.0, 1.0)) @ turn.T, torch.zeros(3, dtype=F64), num(1.0))
-    x = _free(waypoints(level), (turn @ vec(1.0, -2.0, 4.0)).reshape(1, 1, 3))
+    x = free_projection(waypoints(level), (turn @ vec(1.0, -2.0, 4.0)).reshape(1, 1, 3))
     torch.testing.assert_close(x.flatten() @ turn, vec(1.0, -2.0, 1.0), atol=1e-9, rtol=0)  # the same, after a rotation
 
 
 def test_chain_of_two_under_gravity_of_the_first():
     # h = x; x' >= x / 2.  (2, 0): minimise (a - 2)^2 + (a / 2)^2, a = 1.6
-    x = _free(chain(Affine(vec(-1.0), num(0.0)), 0.5), vec(2.0, 0.0).reshape(1, 2, 1))
+    x = free_projection(chain(Affine(vec(-1.0), num(0.0)), 0.5), vec(2.0, 0.0).reshape(1, 2, 1))
     torch.testing.assert_close(x.flatten(), vec(1.6, 0.8), atol=1e-14, rtol=0)
 
 
@@ -113,14 +98,14 @@ def test_chain_from_a_pinned_start_only_raises_what_follows():
 @given(seed=seeds, horizon=st.integers(1, 12))
 def test_chain_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon):
     z = normal(seed, 2, horizon, 2)
-    x = _free(chain(half_space(), 1.0), z)
+    x = free_projection(chain(half_space(), 1.0), z)
     clipped = torch.cat((z[:, :1], nearest(half_space(), z[:, 1:])), 1)
     torch.testing.assert_close(x, clipped, atol=1e-14, rtol=0)
 
 
 def test_a_plan_at_the_centre_of_a_ball_leaves_it_as_slowly_as_the_barrier_allows():
     z = torch.zeros(1, 3, 2, dtype=F64)
-    x = _free(chain(ball(1, centre=(0.0, 0.0), radius=1.0), 0.5), z)  # h = |x| - 1 >= -1: -1, -1/2, -1/4
+    x = free_projection(chain(ball(1, centre=(0.0, 0.0), radius=1.0), 0.5), z)  # h = |x| - 1 >= -1: -1, -1/2, -1/4
     torch.testing.assert_close(x.norm(dim=-1), vec(0.0, 0.5, 0.75)[None], atol=1e-14, rtol=0)
 
 
@@ -131,10 +116,10 @@ def test_a_plan_at_the_centre_of_a_ball_leaves_it_as_slowly_as_the_barrier_allow
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, horizon=st.integers(1, 6))
 def test_projection_is_feasible_and_idempotent(kind, seed, horizon):
-    x = _free(KINDS[kind], normal(seed, 3, horizon, 2, scale=1.5))
+    x = free_projection(KINDS[kind], normal(seed, 3, horizon, 2, scale=1.5))
     rows = KINDS[kind](x)
     assert rows.numel() == 0 or float(rows.max()) <= 1e-9  # the secular root is bisected to float64's resolution
-    torch.testing.assert_close(_free(KINDS[kind], x), x, atol=1e-8, rtol=0)
+    torch.testing.assert_close(free_projection(KINDS[kind], x), x, atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("kind", EXACT)
@@ -143,7 +128,9 @@ def test_projection_is_feasible_and_idempotent(kind, seed, horizon):
 def test_feasible_trajectories_stay_where_they_are(kind, seed):
     z = normal(seed, 40, 2, 2, scale=1.5)
     z = z[(KINDS[kind](z) <= -1e-9).all(1)]
-    torch.testing.assert_close(_free(KINDS[kind], z), z, atol=1e-14, rtol=0)  # a chain re-averages single values: rounding
+    torch.testing.assert_close(
+        free_projection(KINDS[kind], z), z, atol=1e-14, rtol=0
+    )  # a chain re-averages single values: rounding
 
 
 @pytest.mark.parametrize("kind", CONVEX)
@@ -151,7 +138,7 @@ def test_feasible_trajectories_stay_where_they_are(kind, seed):
 @given(seed=seeds, horizon=st.integers(1, 8))
 def test_projection_onto_convex_sets_is_non_expansive(kind, seed, horizon):
     a, b = normal(seed, 4, horizon, 2, scale=2.0), normal(seed + 1, 4, horizon, 2, scale=2.0)
-    moved = (_free(KINDS[kind], a) - _free(KINDS[kind], b)).flatten(1).norm(dim=1)
+    moved = (free_projection(KINDS[kind], a) - free_projection(KINDS[kind], b)).flatten(1).norm(dim=1)
     assert bool((moved <= (a - b).flatten(1).norm(dim=1) + 1e-9).all())  # 1e-9: the bisection's resolution
 
 
@@ -196,7 +183,7 @@ def test_float32_projections_are_feasible_to_float32(kind):
 def test_half_space_agrees_with_proxqp(seed):
     a, z = normal(seed, 2), normal(seed + 1, 2, 3, 2)
     g = waypoints(Affine(a, num(0.1)))
-    torch.testing.assert_close(_free(g, z), _qp(g, z), atol=QP, rtol=0)
+    torch.testing.assert_close(free_projection(g, z), qp_projection(g, z), atol=QP, rtol=0)
 
 
 @quick
@@ -207,13 +194,13 @@ def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
     turn = 2.4 * torch.arange(n) + float(normal(seed + 1, 1))
     g = stack([waypoints(Affine(torch.stack((a.cos(), a.sin())).to(z), num(0.2)), f"w{i}") for i, a in enumerate(turn)])
     torch.testing.assert_close(
-        _free(g, z), _qp(g, z), atol=1e-5, rtol=0
+        free_projection(g, z), qp_projection(g, z), atol=1e-5, rtol=0
     )  # Dykstra stops when a round moves 1e-10; at sharp corners slower
 
 
 def test_a_half_space_and_a_chain_together_agree_with_proxqp():
     g, z = stack([chain(half_space(), 0.3), waypoints(Affine(vec(0.0, 1.0), num(0.1)))]), normal(7, 3, 5, 2)
-    torch.testing.assert_close(_free(g, z), _qp(g, z), atol=1e-5, rtol=0)  # as above
+    torch.testing.assert_close(free_projection(g, z), qp_projection(g, z), atol=1e-5, rtol=0)  # as above
 
 
 @pytest.mark.parametrize("alpha", [1e-3, 0.02, 0.3, 0.9, 1.0])
@@ -229,7 +216,7 @@ def test_half_space_chain_agrees_with_proxqp(horizon, alpha, pinned):
         assert torch.equal(x, z)
         return
     assert float(g(x).max()) <= 1e-12  # rounding
-    torch.testing.assert_close(x, _qp(g, z, pins), atol=QP, rtol=0)
+    torch.testing.assert_close(x, qp_projection(g, z, pins), atol=QP, rtol=0)
 
 
 @settings(max_examples=15, deadline=None)
@@ -240,7 +227,7 @@ def test_chain_between_two_pinned_ends_agrees_with_proxqp(seed, horizon, alpha):
     g, pins = chain(half_space(), alpha), pin(z, 0, -1)
     x = project(g, z, pins)
     assert torch.equal(x[:, [0, -1]], z[:, [0, -1]])
-    torch.testing.assert_close(x, _qp(g, z, pins), atol=QP, rtol=0)
+    torch.testing.assert_close(x, qp_projection(g, z, pins), atol=QP, rtol=0)
 
 
 def test_chain_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
@@ -249,7 +236,7 @@ def test_chain_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
     pins = pin(z, 0, 2, columns=[0])
     x = project(chain(half_space(), 0.3), z, pins)
     assert torch.equal(x[:, [0, 2], 0], z[:, [0, 2], 0])
-    torch.testing.assert_close(x, _qp(chain(half_space(), 0.3), z, pins), atol=QP, rtol=0)
+    torch.testing.assert_close(x, qp_projection(chain(half_space(), 0.3), z, pins), atol=QP, rtol=0)
 
 
 def test_half_space_moves_only_the_free_coordinate_of_a_pinned_state():
@@ -312,7 +299,7 @@ def test_chain_over_a_ball_exterior_is_feasible_and_optimal_against_brute_force(
     level = ball(1, centre=(0.0, 0.0), radius=1.0)
     z = normal(seed, 1, 3, 2, scale=0.7)
     g = chain(level, alpha)
-    x = _free(g, z)
+    x = free_projection(g, z)
     assert float(g(x).max()) <= 1e-12
     # only radii matter: each waypoint moves along its own ray, so three radii are searched on a grid
     r = torch.linspace(0, 3, 151, dtype=F64)

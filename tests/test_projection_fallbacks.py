@@ -1,72 +1,56 @@
 """Projection where no closed form serves: intersections, opaque rows, sequential linearisation, and what is refused."""
 
-import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints, stack
+from cdiff_cli.constraint import Chain, Constraint, Opaque, Waypoints, stack
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Quadric
 from cdiff_cli.projection import project
 from tests.problems import (
     F64,
     KINDS,
+    QP,
     ball,
     chain,
-    dense_jacobian,
     ellipsoid,
+    free_projection,
     half_space,
     normal,
     num,
     opaque,
     pin,
-    qp_project,
     vec,
     waypoints,
 )
-
-QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupled ones with alpha = 1e-3 cost digits
-
-
-def _free(g, z):
-    return project(g, z, Pins.none(z))
-
-
-def _qp(g, z, pins=None):
-    """The nearest trajectories by ProxQP, for affine rows."""
-    fixed = None if pins is None else pins.mask.flatten().numpy()
-    out = []
-    for one in z:
-        J, offset = dense_jacobian(g, one[None])
-        out.append(qp_project(J, -offset, one.flatten().numpy(), fixed).reshape(one.shape))
-    return torch.from_numpy(np.stack(out))
-
 
 # several, sequential, infeasible --------------------------------------------------------------------------------------
 
 
 def test_inside_a_ball_and_a_half_space_ends_on_both():
     g = stack([waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0), "b"), waypoints(Affine(vec(1.0, 0.0), num(0.6)), "h")])
-    x = _free(g, vec(3.0, 3.0).reshape(1, 1, 2))
+    x = free_projection(g, vec(3.0, 3.0).reshape(1, 1, 2))
     torch.testing.assert_close(x.flatten(), vec(0.6, 0.8), atol=1e-6, rtol=0)  # the corner; Dykstra stops at 1e-10 a round
 
 
 def test_outside_two_balls_is_feasible():
     g = stack([waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "a"), waypoints(ball(1, centre=(1.5, 0.0), radius=1.0), "b")])
-    x = _free(g, normal(2, 6, 4, 2, scale=0.8))
+    x = free_projection(g, normal(2, 6, 4, 2, scale=0.8))
     assert float(g(x).max()) <= 1e-5  # what project promises of a non-convex intersection
 
 
 def test_opaque_half_space_falls_back_to_linearisation_and_agrees():
     z = normal(3, 2, 3, 2)
-    x = _free(opaque(lambda x: x[..., 0] - x[..., 1] - 0.2), z)
-    torch.testing.assert_close(x, _free(waypoints(half_space()), z), atol=QP, rtol=0)
+    x = free_projection(opaque(lambda x: x[..., 0] - x[..., 1] - 0.2), z)
+    torch.testing.assert_close(x, free_projection(waypoints(half_space()), z), atol=QP, rtol=0)
 
 
 def test_opaque_ball_falls_back_to_linearisation_and_agrees():
     z = normal(4, 3, 2, 2, scale=2.0)
-    x = _free(opaque(lambda x: x.square().sum(-1) - 1), z)
-    torch.testing.assert_close(x, _free(waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0)), z), atol=QP, rtol=0)  # convex: the same
+    x = free_projection(opaque(lambda x: x.square().sum(-1) - 1), z)
+    torch.testing.assert_close(
+        x, free_projection(waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0)), z), atol=QP, rtol=0
+    )  # convex: the same
 
 
 def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
@@ -79,18 +63,18 @@ def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
 
 def test_dcbf_over_an_ellipsoid_is_reached_by_linearisation():
     g, z = chain(ellipsoid(-1), 0.5), normal(6, 2, 3, 2)
-    assert float(g(_free(g, z)).max()) <= 1e-5  # what project promises
+    assert float(g(free_projection(g, z)).max()) <= 1e-5  # what project promises
 
 
 def test_two_half_spaces_that_exclude_each_other_are_named():
     g = stack([waypoints(Affine(vec(1.0, 0.0), num(-1.0)), "left"), waypoints(Affine(vec(-1.0, 0.0), num(-1.0)), "right")])
     with pytest.raises(InfeasibleError, match=r"(left|right)@0.*over"):
-        _free(g, torch.zeros(1, 1, 2, dtype=F64))
+        free_projection(g, torch.zeros(1, 1, 2, dtype=F64))
 
 
 def test_an_empty_quadric_is_refused():
     with pytest.raises(InfeasibleError, match="no feasible point at all"):
-        _free(waypoints(Quadric(torch.eye(2, dtype=F64), vec(0.0, 0.0), num(-1.0))), torch.zeros(1, 1, 2, dtype=F64))
+        free_projection(waypoints(Quadric(torch.eye(2, dtype=F64), vec(0.0, 0.0), num(-1.0))), torch.zeros(1, 1, 2, dtype=F64))
 
 
 @pytest.mark.parametrize("kind", ["half-space", "outside ball", "stack"])

@@ -16,6 +16,7 @@ from cdiff_cli.errors import SpecError
 from cdiff_cli.levels import Affine
 from cdiff_cli.spec import json_schema, load_constraints
 from cdiff_cli.tasks import TASKS, load_task
+from tests.problems import refused_at
 
 SHIPPED = sorted((Path(__file__).parent.parent / "constraints").glob("*.yaml"))
 LAYOUT = ("x", "y", "vx", "vy")
@@ -248,11 +249,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_mistake_is_answered_with_file_line_and_field(case, tmp_path):
-    text, start = MISTAKES[case]
-    path = write(tmp_path, text)
-    with pytest.raises(SpecError) as caught:
-        load_constraints(path, "maze2d-umaze", LAYOUT)
-    assert str(caught.value).startswith(f"{path}:{start}"), str(caught.value)
+    refused_at(write(tmp_path, MISTAKES[case][0]), MISTAKES[case][1])
 
 
 def test_a_missing_constraint_file_lists_those_that_are_there(tmp_path):

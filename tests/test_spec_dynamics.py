@@ -12,12 +12,12 @@ import cdiff_cli.explain
 from cdiff_cli.certificate import Saved, certificate
 from cdiff_cli.constraint import Chain, Segments, Waypoints
 from cdiff_cli.dynamics import LinearDynamics, Reachable
-from cdiff_cli.errors import SpecError
 from cdiff_cli.levels import Ellipsoid
 from cdiff_cli.metrics import rollout_metrics
 from cdiff_cli.spec import Dynamics, enforced, json_schema, load_constraints
 from cdiff_cli.tasks import load_task
 from cdiff_cli.verify import verify_run
+from tests.problems import refused_at
 from tests.test_spec import BALL, LAYOUT, item, write
 from tests.test_verify import edit, make_run, verify
 
@@ -127,11 +127,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_mistake_is_answered_with_file_line_and_field(case, tmp_path):
-    text, start = MISTAKES[case]
-    path = write(tmp_path, text)
-    with pytest.raises(SpecError) as caught:
-        load_constraints(path, "maze2d-umaze", LAYOUT)
-    assert str(caught.value).startswith(f"{path}:{start}"), str(caught.value)
+    refused_at(write(tmp_path, MISTAKES[case][0]), MISTAKES[case][1])
 
 
 def test_the_schema_knows_dynamics_and_safety():

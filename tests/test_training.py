@@ -335,6 +335,20 @@ def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
     assert torch.equal(torch.rand(2), expected)
 
 
+def test_dynamics_that_explain_too_little_are_not_kept(monkeypatch, tmp_path):
+    """Plans would be held to them; the card still says how much they explain."""
+    poor = cdiff_cli.training.fit
+    monkeypatch.setattr(cdiff_cli.training, "fit", lambda *data: (poor(*data)[0], 0.98))
+    checkpoint = fit(tmp_path)
+    assert checkpoint.dynamics is None
+    assert checkpoint.card.linear == 0.98
+
+
+def test_the_maze_keeps_its_dynamics(whole):
+    assert whole.dynamics is not None
+    assert whole.card.linear > 0.99
+
+
 # recipes --------------------------------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,6 @@ the batch; its matrices are made before the clock starts. Both solve min sum_k w
 
 import argparse
 import statistics
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +18,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from scipy import sparse
+from timing import milliseconds
 
 from cdiff_cli.closed_forms import nearest_chain, pool_violators
 
@@ -44,16 +44,6 @@ def draw(kind: str, batch: int, n: int) -> torch.Tensor:
         "drop after a rise": torch.where(s < 1, s, -1e3),
         "peak before a rise": torch.where(s > 0, s, 1e3),
     }[kind]
-
-
-def milliseconds(run: Callable[[], Any], repeats: int) -> float:
-    run()
-    taken = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        taken.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(taken)
 
 
 def qp(h: np.ndarray, gamma: float, w: np.ndarray, solver: str, dense: bool, **options: Any) -> Callable[[], np.ndarray | None]:

@@ -7,12 +7,8 @@ whole batch. ProxQP (qpsolvers, sparse) solves the same problem with dynamics, t
 """
 
 import argparse
-import statistics
-import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import qpsolvers
@@ -20,6 +16,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 from scipy import sparse
+from timing import milliseconds
 
 from cdiff_cli.constraint import Constraint, Pins, pull_back
 from cdiff_cli.dynamics import Reachable, dynamics_of, split
@@ -28,17 +25,6 @@ from cdiff_cli.request import Options, resolve
 from cdiff_cli.segments import planes
 
 CONSTRAINTS = Path(__file__).parents[2] / "constraints"
-
-
-def clock(work: Callable[[], Any], repeats: int) -> float:
-    """Median wall time, ms, after a warm-up."""
-    work()
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - began)
-    return 1e3 * statistics.median(times)
 
 
 def proxqp(part: Reachable, g: Constraint, x: torch.Tensor, mask: torch.Tensor) -> float:
@@ -75,7 +61,7 @@ def proxqp(part: Reachable, g: Constraint, x: torch.Tensor, mask: torch.Tensor) 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ProxQP's format advice
         assert qpsolvers.solve_qp(**problem, solver="proxqp", eps_abs=5e-4) is not None
-        return clock(lambda: qpsolvers.solve_qp(**problem, solver="proxqp", eps_abs=5e-4), 2)
+        return milliseconds(lambda: qpsolvers.solve_qp(**problem, solver="proxqp", eps_abs=5e-4), 2)
 
 
 def measure(task: str, batch: int, repeats: int) -> list[str]:
@@ -98,13 +84,13 @@ def measure(task: str, batch: int, repeats: int) -> list[str]:
     waypoints, segments = pull_back(problem.g, *back).to(z), split(whole)[0]
     with torch.inference_mode():
         warm = project_from(whole, z, pins, None, 10)[1]
-        network = clock(lambda: problem.denoiser(z, 10), repeats)
+        network = milliseconds(lambda: problem.denoiser(z, 10), repeats)
         parts = [
-            clock(lambda: project_from(waypoints, z, pins, None, 0), repeats),
-            clock(lambda: project_from(segments, z, pins, None, 0), repeats),
-            clock(lambda: project_from(whole, z, pins, warm, 10, 0.0), repeats),
+            milliseconds(lambda: project_from(waypoints, z, pins, None, 0), repeats),
+            milliseconds(lambda: project_from(segments, z, pins, None, 0), repeats),
+            milliseconds(lambda: project_from(whole, z, pins, warm, 10, 0.0), repeats),
         ]
-        fine = clock(lambda: project_from(whole64, z64, pins64, None, 600, 5e-4), max(repeats // 3, 1))
+        fine = milliseconds(lambda: project_from(whole64, z64, pins64, None, 600, 5e-4), max(repeats // 3, 1))
         rival = batch * proxqp(dynamics_of(problem.enforced)[0], split(problem.enforced)[0], x[:1], mask)
     cells = [text for ms in parts for text in (f"{ms:.2f}", f"{100 * ms / network:.0f}")]
     return [str(batch), f"{network:.1f}", *cells, f"{fine:.1f}", f"{rival:.0f}", f"{rival / fine:.0f}"]
