@@ -49,7 +49,7 @@ class Plans:
     """Plans of one batch and what making them took.
 
     x              [n, horizon, dim] float64, environment units
-    trace          total violation a plan by network call: of x_t, of its clean estimate   [calls, 2, n]
+    trace          total violation of the scored g a plan by network call: of x_t, of its clean estimate   [calls, 2, n]
     chain          every x_t, kept where small   [calls + 1, n, horizon, dim] or None
     polish         largest displacement by the final polish, environment units   [n]
     u              inputs that produce x, where dynamics were obeyed   [n, horizon - 1, m] or None
@@ -114,7 +114,7 @@ def plan(
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
     inside = _tighten_others(problem.enforced, CLEARANCE) if dynamics_of(problem.enforced) else problem.enforced
-    g = pull_back(inside, centre, scale).to(like)
+    g, scored = (pull_back(constraint, centre, scale).to(like) for constraint in (inside, problem.g))
     pins = make_pins(problem, len(seeds))
     shape = (problem.horizon, dim)
     total = problem.schedule.n_steps + extra_steps
@@ -133,7 +133,7 @@ def plan(
     def record(call: int, step: Step, x: Traj) -> None:
         nonlocal watching_s
         began = time.perf_counter()
-        trace.append(torch.stack([g(step.x).clamp_min(0).sum(1), g(step.x0).clamp_min(0).sum(1)]).cpu())
+        trace.append(torch.stack([scored(x_t).clamp_min(0).sum(1) for x_t in (step.x, step.x0)]).cpu())
         if keep_chain:
             chain.append(step.x.cpu())
             if call == total:

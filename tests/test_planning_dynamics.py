@@ -126,3 +126,11 @@ def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolve
     for method in (Projected(), make_method("alm", {})):
         plans = plan(problem, method, [0], polish=True)
         assert np.abs(plans.x[0, -1] - problem.goal).max() < 1e-3
+
+
+def test_the_trace_counts_the_constraints_as_they_are_scored_and_not_the_dynamics(resolved):
+    scored = Constraint(tuple(part for part in resolved.problem.g.parts if part not in dynamics_of(resolved.problem.g)))
+    problem = replace(resolved.problem, g=scored)
+    plans = plan(problem, resolved.method, [0], kernel=resolved.kernel)
+    noisy = [float(scored(torch.from_numpy(x)).clamp_min(0).sum()) for x in plans.chain[:-1]]
+    np.testing.assert_allclose(plans.trace[:, 0, 0], noisy, rtol=1e-4, atol=1e-4)  # the trace is kept in float32
