@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.runs import METHOD_ORDER
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,7 +26,7 @@ out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width
 
 RUNS = Path("runs")
 TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large or gaussian2d")]
-MethodName = Annotated[str, typer.Option("--method", help="diffuser, projected, primal-dual or alm")]
+MethodName = Annotated[str, typer.Option("--method", help=", ".join(METHOD_ORDER))]
 PresetName = Annotated[str, typer.Option("--preset", help="recommended (ours), paper (as printed), released (the authors' code)")]
 ConstraintFile = Annotated[Path | None, typer.Option("--constraints", help="YAML file of constraints [default: the task's own]")]
 CheckpointFile = Annotated[Path | None, typer.Option("--checkpoint", help="a .safetensors checkpoint [default: the shipped one]")]
@@ -35,6 +36,9 @@ Kernel = Annotated[str | None, typer.Option("--kernel", help="ddpm, ddim, dpm++2
 Steps = Annotated[
     int | None,
     typer.Option("--steps", help="diffusion steps, at most as trained; few go best with --kernel dpm++2m [default: the preset's]"),
+]
+ExtraSteps = Annotated[
+    int | None, typer.Option("--extra-steps", help="further steps with t frozen and no noise [default: the preset's]")
 ]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="a method's constant, as rho=0.05; may be repeated")]
 Count = Annotated[int, typer.Option("--n", "--episodes", help="number of plans, one seed each")]
@@ -214,6 +218,7 @@ def plan(
     no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
+    extra_steps: ExtraSteps = None,
     settings: Settings = None,
     n: Count = 10,
     seed: Seed = 0,
@@ -248,6 +253,7 @@ def rollout(
     no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
+    extra_steps: ExtraSteps = None,
     settings: Settings = None,
     n: Count = 10,
     seed: Seed = 0,

@@ -118,6 +118,7 @@ class Step:
     level     sqrt(alpha_bar_{t-1}), the share of the clean trajectory in x_{t-1}
     reverse   clean estimate -> x_{t-1}; noise z and pins already bound; the next step's kernel knows the last estimate given
     last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
+    left      denoising steps still to come: 0 in the last and in the frozen ones
     """
 
     x: Traj
@@ -127,6 +128,7 @@ class Step:
     reverse: Callable[[Traj], Traj]
     pins: Pins
     last: bool
+    left: int = 0
 
 
 class Method(Protocol):
@@ -188,7 +190,7 @@ def sample(
             used = clean, a
             return pins.paint(kernel(x, clean, z, a, b, previous))
 
-        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last)
+        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last, i - 1)
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)

@@ -86,15 +86,15 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         kernel=resolved.kernel,
         on_step=lambda call: tick("diffuser", call, calls),
     )
-    if isinstance(resolved.method, Unconstrained):
+    if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
         return free, free
-    total = calls + resolved.preset.extra_steps
+    total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
     plans = plan(
         resolved.problem,
         resolved.method,
         resolved.seeds,
         kernel=resolved.kernel,
-        extra_steps=resolved.preset.extra_steps,
+        extra_steps=resolved.extra_steps,
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )

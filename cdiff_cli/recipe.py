@@ -10,6 +10,7 @@ from cdiff_cli.config import Strict, load
 from cdiff_cli.errors import CdiffError
 
 Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
 
 
 class NetworkSpec(Strict):
@@ -57,6 +58,7 @@ class Preset(Strict):
     """How to sample.
 
     steps       network calls to respace the schedule to; None: as trained
+    extra_steps further steps with t frozen and no noise; extra_steps_of: the number of a method that has its own
     polish      project the finished plans once more, in float64
     safety      where constraints hold that do not say so themselves
     dynamics    obey the checkpoint's linear dynamics too
@@ -65,11 +67,15 @@ class Preset(Strict):
 
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
     steps: Positive | None = None
-    extra_steps: Annotated[int, Field(ge=0)] = 0
+    extra_steps: Count = 0
+    extra_steps_of: dict[str, Count] = {}
     polish: bool = False
     safety: Literal["waypoints", "segments"] = "waypoints"
     dynamics: bool = False
     methods: dict[str, dict[str, Any]] = {}
+
+    def extra_steps_for(self, method: str) -> int:
+        return self.extra_steps_of.get(method, self.extra_steps)
 
 
 class Recipe(Strict):

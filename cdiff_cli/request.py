@@ -41,6 +41,7 @@ class Options:
     goal: str | None = None
     kernel: str | None = None
     steps: int | None = None
+    extra_steps: int | None = None
     settings: tuple[str, ...] = ()
     n: int = 10
     seed: int = 0
@@ -65,6 +66,12 @@ class Resolved:
     checkpoint: Checkpoint | None
 
     @property
+    def extra_steps(self) -> int:
+        """Frozen steps after the last: those asked for, else the preset's for this method."""
+        asked = self.options.extra_steps
+        return self.preset.extra_steps_for(self.options.method) if asked is None else asked
+
+    @property
     def seeds(self) -> list[int]:
         return list(range(self.options.seed, self.options.seed + self.options.n))
 
@@ -82,7 +89,7 @@ class Resolved:
     def _changed(self) -> bool:
         """Whether an option departs from the preset."""
         asked = self.options
-        return bool(asked.settings or asked.kernel or asked.steps or asked.no_dynamics)
+        return bool(asked.settings or asked.kernel or asked.steps or asked.extra_steps is not None or asked.no_dynamics)
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
@@ -93,7 +100,7 @@ class Resolved:
             "options": options | {"settings": list(self.options.settings)},
             "method": {self.options.method: self.settings},
             "kernel": self.kernel,
-            "extra_steps": self.preset.extra_steps,
+            "extra_steps": self.extra_steps,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
@@ -117,6 +124,8 @@ def resolve(options: Options) -> Resolved:
     task = load_task(options.task)
     if options.n < 1:
         raise CdiffError(f"--n: expected at least 1 plan, found {options.n}")
+    if (options.extra_steps or 0) < 0:
+        raise CdiffError(f"--extra-steps: expected 0 or more, found {options.extra_steps}")
     if options.method not in METHODS:
         make_method(options.method, {})
     recipe = load_recipe(options.task)

@@ -187,7 +187,17 @@ def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> list[G
     return groups
 
 
-METHOD_ORDER = ("diffuser", "guidance", "conditional", "safediffuser", "projected", "primal-dual", "alm")
+METHOD_ORDER = (
+    "diffuser",
+    "guidance",
+    "best-of-k",
+    "final-projection",
+    "terminal",
+    "safediffuser",
+    "projected",
+    "primal-dual",
+    "alm",
+)
 PRESET_ORDER = ("paper", "released", "recommended")
 
 

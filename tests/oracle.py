@@ -309,7 +309,8 @@ def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
     for label, preset in load_recipe(task).presets.items():
         for name in METHODS:
             if name != "diffuser":
-                runs.append(Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), preset))
+                own = preset.model_copy(update={"extra_steps": preset.extra_steps_for(name)})
+                runs.append(Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), own))
     return runs
 
 

@@ -25,8 +25,10 @@ RANKS = {
     "recipe": 3,
     "spec": 5,
     "projection": 5,
-    "methods": 6,
+    "safediffuser": 6,
+    "baselines": 6,
     "tasks": 6,
+    "methods": 7,
     "data": 7,
     "metrics": 7,
     "checkpoint": 8,
@@ -81,7 +83,9 @@ def test_the_import_check_sees_both_ways_of_importing():
     assert "runs" in rooms_imported(PACKAGE / "tables.py")
 
 
-@pytest.mark.parametrize("name", ["methods", "constraint", "projection", "diffusion", "networks", "spec"])
+@pytest.mark.parametrize(
+    "name", ["methods", "safediffuser", "baselines", "constraint", "projection", "diffusion", "networks", "spec"]
+)
 def test_the_mathematics_knows_no_environment(name):
     path = PACKAGE / f"{name}.py"
     outside = {module.split(".")[0] for module, _ in imports(path)}
