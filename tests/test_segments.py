@@ -292,7 +292,7 @@ def test_the_nearest_point_in_half_planes_is_the_least_distance_and_has_multipli
     for i in range(2):
         for tau in range(4):
             A, at, to = a[i, tau].numpy(), z[i, tau].numpy(), x[i, tau].numpy()
-            np.testing.assert_allclose(to, least_distance(A, b[i, tau].numpy(), at), atol=1e-6)  # nnls' own rounding in sharp corners
+            np.testing.assert_allclose(to, least_distance(A, b[i, tau].numpy(), at), atol=1e-6)  # the rounding of nnls
             active = A[A @ to - b[i, tau].numpy() > -1e-9]
             if not len(active):
                 np.testing.assert_array_equal(to, at)
