@@ -12,6 +12,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
     "maze2d-large": "cdiff_cli.tasks.maze2d:LARGE",
+    "ball-run": "cdiff_cli.tasks.ball_run:BALL_RUN",
     "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
 }
 
