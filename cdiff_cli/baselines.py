@@ -30,6 +30,23 @@ class Guidance:
 
 
 @dataclass(frozen=True)
+class Conditional:
+    """The paper's Conditional: a planner trained with labels that say whether a window obeys the constraints, asked for one that
+    does (conditioning.py); its step is the plain one.
+
+    weight   of classifier-free guidance: 1 is the conditioned estimate itself, above it two network calls a step
+    """
+
+    weight: float = 2.0
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        return step.reverse(step.x0), None
+
+
+@dataclass(frozen=True)
 class Terminal:
     """Only the trajectory that sampling ends at is asked to obey, as DiRecT does (Giaretta et al., 2026): the clean estimate is
     projected and the sample follows by the whole displacement, x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0).

@@ -88,14 +88,19 @@ def progress() -> Iterator[Callable[[str, int, int], None]]:
 @reported
 def train(
     task: TaskName = "maze2d-umaze",
-    recipe: Annotated[str, typer.Option(help="small (minutes on two cores) or paper (the paper's size)")] = "small",
+    recipe: Annotated[
+        str | None, typer.Option(help="small (minutes on two cores), paper (the paper's size) or conditional [default: small]")
+    ] = None,
+    conditional: Annotated[
+        Path | None, typer.Option(help="YAML file of constraints to train a planner for, which --method conditional uses")
+    ] = None,
     seed: Annotated[int, typer.Option(help="seed of the weights, the noise and the order of the data")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last saved state of this training")] = False,
     dataset: Annotated[str | None, typer.Option(help="a local Minari dataset id or a D4RL-style .hdf5 [default: generate]")] = None,
     device: Device = "auto",
     runs: RunsFolder = RUNS,
 ) -> None:
-    """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors and its card."""
+    """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors (or conditional-FILE) and its card."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from cdiff_cli import training
@@ -105,7 +110,16 @@ def train(
 
     problem = load_task(task)
     plan = load_recipe(task)
-    work = runs / f"train-{task}-{recipe}-{seed}"
+    condition = None
+    if conditional is not None:
+        from cdiff_cli.conditioning import Condition, content_sha256
+        from cdiff_cli.spec import load_constraints
+
+        kinds, g = load_constraints(conditional, problem.name, problem.layout)
+        condition = Condition(conditional.stem, g, content_sha256(kinds))
+    recipe = recipe or ("conditional" if condition else "small")
+    name = f"conditional-{condition.name}" if condition else recipe
+    work = runs / f"train-{task}-{name}-{seed}"
     shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
     columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
@@ -134,6 +148,7 @@ def train(
                 work=work,
                 resume=resume,
                 dataset=dataset,
+                condition=condition,
                 on_data=on_data,
                 on_step=on_step,
             )
@@ -143,7 +158,7 @@ def train(
     card = checkpoint.card
     target = install(checkpoint)
     out.print(f"{card.steps} steps in {card.wall_s / 60:.1f} min on {card.device}: mean squared error {card.mse:.5f}")
-    out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {recipe}.previous.safetensors)", highlight=False)
+    out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {name}.previous.safetensors)", highlight=False)
 
 
 def options(values: dict[str, Any]) -> Any:

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 import torch
 from torch.nn import functional as F
 
-from cdiff_cli.baselines import BestOf, FinalProjection, Guidance, Terminal
+from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
 from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
@@ -178,6 +178,7 @@ class AugmentedLagrangian:
 METHODS: dict[str, type[Method]] = {
     "diffuser": Unconstrained,
     "guidance": Guidance,
+    "conditional": Conditional,
     "best-of-k": BestOf,
     "final-projection": FinalProjection,
     "terminal": Terminal,

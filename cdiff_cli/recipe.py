@@ -21,6 +21,7 @@ class NetworkSpec(Strict):
     multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
     patch: Literal[1, 2, 4, 8, 16] = 1
     octaves: Annotated[int, Field(ge=0, le=10)] = 0
+    conditions: Count = 0
 
     @property
     def stride(self) -> int:
@@ -34,6 +35,7 @@ class MlpSpec(Strict):
     kind: Literal["mlp"]
     width: Positive = 256
     depth: Positive = 3
+    conditions: Count = 0
 
     @property
     def stride(self) -> int:
@@ -56,7 +58,11 @@ class InverseSpec(Strict):
 
 
 class TrainSpec(Strict):
-    """One way to train; the defaults are those of the small recipe."""
+    """One way to train; the defaults are those of the small recipe.
+
+    begin     the recipe whose checkpoint is trained on, None: from the beginning
+    dropout   of conditional planners, share of the windows shown without their label
+    """
 
     network: NetworkSpec | MlpSpec = NetworkSpec()
     steps: Positive
@@ -70,6 +76,8 @@ class TrainSpec(Strict):
     trips: Annotated[float, Field(ge=0, le=1)] = 0.5
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
+    begin: str | None = None
+    dropout: Annotated[float, Field(gt=0, lt=1)] = 0.25
     inverse: InverseSpec | None = None
 
 
@@ -150,6 +158,7 @@ class Card(Strict):
     """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
 
     inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
+    constraints   hash of the constraints that a conditional planner was trained for; None of the others
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -173,6 +182,7 @@ class Card(Strict):
     data: dict[str, float]
     linear: float | None = None
     inverse: dict[str, float] | None = None
+    constraints: str | None = None
 
 
 def home() -> Path:

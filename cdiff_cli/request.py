@@ -10,12 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cdiff_cli.baselines import Conditional
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
+from cdiff_cli.conditioning import content_sha256, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
-from cdiff_cli.diffusion import KERNELS, Method, Schedule
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
-from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
@@ -64,6 +66,7 @@ class Resolved:
     kinds: Sequence[Kind]
     constraints_path: Path
     checkpoint: Checkpoint | None
+    guided: Denoiser | None = None
 
     @property
     def extra_steps(self) -> int:
@@ -168,7 +171,25 @@ def resolve(options: Options) -> Resolved:
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
     problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
     check_feasible(problem)
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
+    conditioned = _guided(method, kinds, path, checkpoint) if isinstance(method, Conditional) else None
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, conditioned)
+
+
+def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Denoiser:
+    """The denoiser of the planner that was trained for these constraints."""
+    if checkpoint is None:
+        raise CdiffError("conditional: this task's score is exact, no planner can be trained for its constraints")
+    task = checkpoint.card.task
+    where = shown(home() / "models" / task / f"conditional-{path.stem}.safetensors")
+    advice = f"train it with `cdiff train --task {task} --conditional {path}`"
+    if not where.exists():
+        raise CheckpointError(f"{where}: no conditional planner for these constraints; {advice}")
+    found = load_checkpoint(where, task, next(checkpoint.net.parameters()).device)
+    if found.card.constraints != content_sha256(kinds):
+        raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
+    if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
+        raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
+    return guided(found.net, method.weight)
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:

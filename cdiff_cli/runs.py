@@ -190,6 +190,7 @@ def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> list[G
 METHOD_ORDER = (
     "diffuser",
     "guidance",
+    "conditional",
     "best-of-k",
     "final-projection",
     "terminal",

@@ -25,6 +25,7 @@ RANKS = {
     "recipe": 3,
     "spec": 5,
     "projection": 5,
+    "conditioning": 4,
     "safediffuser": 6,
     "baselines": 6,
     "tasks": 6,
