@@ -323,38 +323,15 @@ def compare(
     folder: Annotated[Path, typer.Argument(help="a folder of runs")] = RUNS,
     style: Annotated[str, typer.Option("--format", help="rich, markdown, latex, csv or json")] = "rich",
     paper: Annotated[bool, typer.Option("--paper", help="the paper's definitions and units, its values beside ours")] = False,
+    intervals: Annotated[bool, typer.Option("--intervals", help="95 %: bootstrap of means, Clopper-Pearson of rates")] = False,
+    against: Annotated[str | None, typer.Option(help="test every method against this one, paired by seed, Holm-corrected")] = None,
+    test: Annotated[str, typer.Option(help="of --against: wilcoxon (signed ranks) or t")] = "wilcoxon",
     task: Annotated[str | None, typer.Option(help="only this task")] = None,
 ) -> None:
     """Compare the runs of a folder: mean ± standard error by task, constraints, method and preset; newest row a seed."""
-    from cdiff_cli import runs, tables
-    from cdiff_cli.errors import suggestion
-    from cdiff_cli.recipe import home
+    from cdiff_cli.comparison import print_comparison
 
-    if style not in tables.FORMATS:
-        raise CdiffError(f'no format "{style}"{suggestion(style, tables.FORMATS)}; choose from {", ".join(tables.FORMATS)}')
-    if not folder.is_dir():
-        raise CdiffError(f"{folder}: no such folder; make a run first: cdiff plan --method alm")
-    plans, rollouts = (([r for r in rows if task in (None, r["task"])]) for rows in runs.merge_kinds(folder))
-    if not plans and not rollouts:
-        raise CdiffError(f"{folder}: no runs{f' of {task}' if task else ''} here; make one first: cdiff plan --method alm")
-    values = tables.read_paper(home() / "runs" / "reference" / "paper.csv") if paper else None
-    plan_table = runs.PAPER_TABLE if paper else runs.PLAN_TABLE
-    wanted = [("plans", plans, plan_table), ("rollouts", rollouts, tuple(dict.fromkeys((*runs.SAFETY_TABLE, *runs.ROLLOUT_TABLE))))]
-    shown = [(title, runs.compare(rows), table) for title, rows, table in wanted if rows]
-    if style == "json":
-        found = {title: json.loads(tables.render(groups, table, style, values)) for title, groups, table in shown}
-        typer.echo(json.dumps(found, indent=2))
-        return
-    for title, groups, table in shown:
-        text = tables.render(groups, table, style, values if title == "plans" else None, title)
-        if style == "rich":
-            out.print(text)
-        else:
-            typer.echo(text)
-    if style == "rich":
-        out.print(
-            "mean ± standard error over n seeds, the newest row of each; a preset with * was changed by an option", style="dim"
-        )
+    print_comparison(folder, out, style=style, paper=paper, intervals=intervals, against=against, test=test, task=task)
 
 
 @app.command()

@@ -14,6 +14,7 @@ PACKAGE = ROOT / "cdiff_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RANKS = {
     "errors": 0,
+    "inference": 0,
     "config": 1,
     "levels": 1,
     "constraint": 2,
@@ -42,6 +43,7 @@ RANKS = {
     "certificate": 11,
     "tables": 12,
     "request": 12,
+    "comparison": 13,
     "explain": 12,
     "verify": 12,
     "experiment": 14,
