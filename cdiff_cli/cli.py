@@ -336,6 +336,36 @@ def compare(
 
 @app.command()
 @reported
+def sweep(
+    task: Annotated[str, typer.Option(help="tasks, separated by commas")] = "maze2d-umaze",
+    methods: Annotated[str, typer.Option(help="methods, separated by commas")] = "diffuser,projected,primal-dual,alm",
+    presets: Annotated[str, typer.Option(help="presets, separated by commas")] = "recommended",
+    constraints: Annotated[list[Path] | None, typer.Option(help="YAML file of constraints; may be repeated [default: own]")] = None,
+    seeds: Annotated[int, typer.Option(help="number of seeds, a run each")] = 10,
+    seed: Seed = 0,
+    random: Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each seed")] = False,
+    rollout: Annotated[bool, typer.Option("--rollout", help="follow the plans in the simulator too")] = False,
+    jobs: Annotated[int, typer.Option(help="runs at a time, each on one thread")] = 1,
+    backend: Annotated[str, typer.Option(help="local, or a cluster: ray or dask (optional extras)")] = "local",
+    address: Annotated[str | None, typer.Option(help="of the cluster's head, as 127.0.0.1:6379")] = None,
+    runs: RunsFolder = RUNS,
+) -> None:
+    """Make the missing runs of a matrix (task, constraints, preset, method, seed); start it again and it goes on. Exit code 1 where
+    a run failed. `cdiff compare` then prints the table.
+    """
+    from cdiff_cli.sweep import Matrix, run_sweep
+
+    tasks, named, asked = ([name.strip() for name in text.split(",") if name.strip()] for text in (task, methods, presets))
+    matrix = Matrix(tasks, named, asked, constraints or [None], range(seed, seed + seeds), rollout, random)
+    failed = run_sweep(matrix, runs, jobs, err, backend, address)
+    for outcome in failed:
+        typer.echo(f"failed: {outcome.job.name}: {outcome.error}", err=True)
+    typer.echo(f"compare them with: cdiff compare {runs}")
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+@reported
 def check(
     file: Annotated[Path | None, typer.Argument(help="a constraint file")] = None,
     schema: Annotated[bool, typer.Option("--schema", help="print the JSON schema of constraint files, for editors")] = False,
