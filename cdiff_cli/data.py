@@ -201,8 +201,8 @@ def _episode_buffer(rows: dict[str, Any], number: int) -> Any:
     from minari.data_collector import EpisodeBuffer
 
     n = len(rows["actions"])
-    first = rows["observations"][0]
-    stacked = {key: np.stack([obs[key] for obs in rows["observations"]]) for key in first}
+    seen = rows["observations"]
+    stacked = {key: np.stack([obs[key] for obs in seen]) for key in seen[0]} if isinstance(seen[0], dict) else np.stack(seen)
     last = [False] * (n - 1) + [True]
     return EpisodeBuffer(
         id=number,

@@ -130,6 +130,63 @@ class TemporalUnet(nn.Module):
         return share if end == 0 else share.flip(0)
 
 
+class ResidualMlp(nn.Module):
+    """A residual network on the whole window at once, for the short windows of control: it predicts the clean window from a noisy
+    one whose first waypoint is given.
+
+    Blocks h + W2 silu(W1 norm(h) + step), all of the same width.
+
+    horizon, dim   of a window
+    width, depth   channels and number of the blocks
+    """
+
+    def __init__(self, dim: int, horizon: int, width: int = 256, depth: int = 3) -> None:
+        nn.Module.__init__(self)
+        self.embed = nn.Sequential(SinusoidalStep(64), nn.Linear(64, width), nn.SiLU(), nn.Linear(width, width))
+        self.stem = nn.Linear(horizon * dim, width)
+        self.blocks = nn.ModuleList(
+            nn.ModuleList((nn.LayerNorm(width), nn.Linear(width, width), nn.Linear(width, width))) for _ in range(depth)
+        )
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, (horizon - 1) * dim))
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """The clean estimate [batch, horizon, dim] of the noisy windows x at the diffusion steps t [batch]."""
+        return self.estimates(x, t)[-1]
+
+    def estimates(self, x: Tensor, t: Tensor) -> list[Tensor]:
+        """As TemporalUnet.estimates; there is one."""
+        h, step = self.stem(x.flatten(1)), self.embed(t)
+        for norm, inward, outward in cast(Any, self.blocks):
+            h = h + outward(F.silu(inward(norm(h)) + step))
+        ahead = self.head(h).to(x).unflatten(1, (x.shape[1] - 1, x.shape[2]))
+        return [torch.cat((x[:, :1], ahead), 1)]
+
+
+class InverseDynamics(nn.Module):
+    """u = IDM(x, x'): the input that leads from a state to another, a network on the normalised state and the normalised change.
+
+    centre, scale      of the state, environment units            [2, dim]: of x, of x' - x
+    low, high          bounds of the input, which u is kept in    [m]
+    """
+
+    def __init__(self, dim: int, inputs: int, width: int = 256) -> None:
+        nn.Module.__init__(self)
+        for name, shape in (("centre", (2, dim)), ("scale", (2, dim)), ("low", (inputs,)), ("high", (inputs,))):
+            self.register_buffer(name, torch.ones(shape) if name == "scale" else torch.zeros(shape))
+        self.layers = nn.Sequential(
+            nn.Linear(2 * dim, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, inputs)
+        )
+
+    def raw(self, x: Tensor, after: Tensor) -> Tensor:
+        """The input before it is clipped [batch, m], of states and their successors [batch, dim], environment units."""
+        centre, scale = cast(Tensor, self.centre), cast(Tensor, self.scale)
+        seen = torch.cat(((x - centre[0]) / scale[0], (after - x - centre[1]) / scale[1]), -1)
+        return cast(Tensor, self.layers(seen))
+
+    def forward(self, x: Tensor, after: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(self.raw(x, after), cast(Tensor, self.low)), cast(Tensor, self.high))
+
+
 def _spline(knots: Tensor, patch: int) -> Tensor:
     """The uniform cubic B-spline of the knots [batch, dim, n], sampled at `patch` points a knot [batch, dim, n * patch];
     the end knots are repeated.
