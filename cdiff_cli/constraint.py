@@ -5,7 +5,7 @@ trajectory: at every waypoint, or as a discrete control barrier function along i
 an exact form; gradients are written out, so that a method pays for a few vector operations and no autograd graph.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, Self
 
@@ -323,6 +323,10 @@ class Constraint:
     def take(self, which: Tensor) -> "Constraint":
         """The same constraint of some plans of the batch alone."""
         return Constraint(tuple(part.take(which) for part in self.parts))
+
+    def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> "Constraint":
+        """The constraint with observed quantities filled in; none observes anything yet."""
+        return self
 
     def to(self, like: Tensor) -> "Constraint":
         """The same constraint with its numbers in the dtype and on the device of `like`."""

@@ -67,11 +67,11 @@ class Plans:
     u: Array | None = None
 
 
-def network_denoiser(net: torch.nn.Module) -> Denoiser:
+def network_denoiser(net: torch.nn.Module, limit: float = 1.0) -> Denoiser:
     """x_t, t -> the network's clean estimate, clipped to the data's limits."""
 
     def clean(x: Traj, t: int) -> Traj:
-        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-1.0, 1.0)
+        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-limit, limit)
 
     return clean
 

@@ -1,7 +1,7 @@
 """From the options of a command to a resolved problem: recipe, preset, method, constraints, checkpoint, pins."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -11,19 +11,22 @@ import torch
 from numpy.typing import NDArray
 
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.constraint import Constraint
+from cdiff_cli.constraint import Chain, Constraint, Part
+from cdiff_cli.control import Controller
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.methods import METHODS, make_method
+from cdiff_cli.margins import read_margins
+from cdiff_cli.methods import METHODS, Unconstrained, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
 from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
-from cdiff_cli.tasks import Task, load_task
+from cdiff_cli.tasks import ControlTask, Task, load_task
 from cdiff_cli.training import choose_device
 
 Array = NDArray[np.float64]
+RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
 VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
@@ -47,6 +50,11 @@ class Options:
     device: str = "auto"
     random: bool = False
     no_dynamics: bool = False
+    execute: int | None = None
+    warm: float | None = None
+    margin: float | None = None
+    action_noise: float = 0.0
+    env: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,7 @@ class Resolved:
     kinds: Sequence[Kind]
     constraints_path: Path
     checkpoint: Checkpoint | None
+    margins: dict[str, float]
 
     @property
     def seeds(self) -> list[int]:
@@ -82,11 +91,13 @@ class Resolved:
     def _changed(self) -> bool:
         """Whether an option departs from the preset."""
         asked = self.options
-        return bool(asked.settings or asked.kernel or asked.steps or asked.no_dynamics)
+        changed = (asked.settings, asked.kernel, asked.steps, asked.no_dynamics, asked.execute, asked.warm, asked.action_noise)
+        return any(changed) or asked.margin is not None
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
         options = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.options).items()}
+        options["env"] = list(self.options.env)
         card = self.checkpoint.card if self.checkpoint else None
         pins = {name: None if s is None else s.tolist() for name, s in self._pins().items()}
         return {
@@ -97,6 +108,7 @@ class Resolved:
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
+            "margins": self.margins,
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -139,7 +151,8 @@ def resolve(options: Options) -> Resolved:
     else:
         where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")
         checkpoint = load_checkpoint(where, task.name, device)
-        denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
+        limit = 1.0 if checkpoint.frame is None else RELATIVE_LIMIT
+        denoiser, normaliser = network_denoiser(checkpoint.net, limit), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     kinds, g = load_constraints(path, task.name, task.layout, checkpoint.dynamics if checkpoint else None)
@@ -157,9 +170,70 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
+    margins = _margins(options, preset, g, path, checkpoint)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, _tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins)
+
+
+def _margins(options: Options, preset: Preset, g: Constraint, path: Path, checkpoint: Checkpoint | None) -> dict[str, float]:
+    """Margin of each constraint by its name: the option's, or the calibrated one; none where the preset wants none."""
+    if options.margin is not None:
+        return {part.name: options.margin for part in g.parts}
+    if not preset.margin or checkpoint is None:
+        return {}
+    found = read_margins(checkpoint.path).get(path.stem)
+    if found is None or found.weights_sha256 != checkpoint.card.weights_sha256:
+        return {}
+    return {name: each.margin for name, each in found.constraints.items()}
+
+
+def _tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
+    """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
+
+    def tight(part: Part) -> Part:
+        margin = margins.get(part.name, 0.0)
+        return part.shift(margin * (part.alpha if isinstance(part, Chain) else 1.0)) if margin else part
+
+    return Constraint(tuple(tight(part) for part in g.parts))
+
+
+def controller(resolved: Resolved) -> Controller:
+    """What acting needs."""
+    problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
+    if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
+        raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
+    execute = preset.execute if options.execute is None else options.execute
+    inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
+    ahead = 1 if inverse is None else inverse.ahead
+    if not 1 <= execute <= problem.horizon - ahead:
+        raise CdiffError(
+            f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
+        )
+    warm = preset.warm if options.warm is None else options.warm
+    if warm is not None and not 0 < warm <= 1:
+        raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
+    if options.action_noise < 0:
+        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
+    return Controller(
+        task=cast(ControlTask, problem.task),
+        denoiser=problem.denoiser,
+        schedule=problem.schedule,
+        frame=checkpoint.frame,
+        inverse=checkpoint.inverse,
+        g=problem.g,
+        enforced=problem.enforced,
+        method=resolved.method,
+        device=problem.device,
+        kernel=resolved.kernel,
+        extra_steps=preset.extra_steps,
+        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
+        temperature=preset.temperature,
+        ahead=ahead,
+        execute=execute,
+        warm=warm,
+        action_noise=options.action_noise,
+    )
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:

@@ -32,6 +32,10 @@ RANKS = {
     "frames": 8,
     "inverse": 8,
     "checkpoint": 9,
+    "margins": 2,
+    "control": 11,
+    "control_figures": 12,
+    "closed_loop": 15,
     "planning": 10,
     "training": 10,
     "figures": 11,
@@ -42,7 +46,7 @@ RANKS = {
     "explain": 12,
     "verify": 12,
     "experiment": 14,
-    "cli": 15,
+    "cli": 16,
 }
 """A room may import only rooms of a lower rank (the files within tasks/ are one room)."""
 
