@@ -15,8 +15,9 @@ from cdiff_cli.control import Controller, Episodes, control
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
 from cdiff_cli.margins import Margin, Margins, conformal, errors, write_margins
+from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
-from cdiff_cli.request import Resolved, controller
+from cdiff_cli.request import Resolved
 from cdiff_cli.runs import Row, new_run, write_rows, write_yaml
 from cdiff_cli.tasks import ControlTask
 from cdiff_cli.training import device_name, git_commit
@@ -68,6 +69,44 @@ def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margi
         constraints=by_name,
     )
     return write_margins(checkpoint.path, resolved.constraints_path.stem, found), found
+
+
+def controller(resolved: Resolved) -> Controller:
+    """What acting needs."""
+    problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
+    if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
+        raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
+    execute = preset.execute if options.execute is None else options.execute
+    inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
+    ahead = 1 if inverse is None else inverse.ahead
+    if not 1 <= execute <= problem.horizon - ahead:
+        raise CdiffError(
+            f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
+        )
+    warm = preset.warm if options.warm is None else options.warm
+    if warm is not None and not 0 < warm <= 1:
+        raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
+    if options.action_noise < 0:
+        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
+    return Controller(
+        task=cast(ControlTask, problem.task),
+        denoiser=problem.denoiser,
+        schedule=problem.schedule,
+        frame=checkpoint.frame,
+        inverse=checkpoint.inverse,
+        g=problem.g,
+        enforced=problem.enforced,
+        method=resolved.method,
+        device=problem.device,
+        kernel=resolved.kernel,
+        extra_steps=resolved.extra_steps,
+        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
+        temperature=preset.temperature,
+        ahead=ahead,
+        execute=execute,
+        warm=warm,
+        action_noise=options.action_noise,
+    )
 
 
 def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import json
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -87,19 +87,21 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         kernel=resolved.kernel,
         on_step=lambda call: tick("diffuser", call, calls),
     )
-    if isinstance(resolved.method, Unconstrained):
+    if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
         return free, free
-    total = calls + resolved.preset.extra_steps
+    total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
+    problem = resolved.problem if resolved.guided is None else replace(resolved.problem, denoiser=resolved.guided)
     plans = plan(
-        resolved.problem,
+        problem,
         resolved.method,
         resolved.seeds,
         kernel=resolved.kernel,
-        extra_steps=resolved.preset.extra_steps,
+        extra_steps=resolved.extra_steps,
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )
-    return plans, free
+    twice = resolved.guided is not None and resolved.settings["weight"] != 1.0  # with and without the condition
+    return replace(plans, calls=2 * plans.calls) if twice else plans, free
 
 
 def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:

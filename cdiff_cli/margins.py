@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cdiff_cli.config import Dumper, Strict, load
+from cdiff_cli.constraint import Chain, Constraint, Part
 from cdiff_cli.errors import CdiffError
 
 Array = NDArray[np.float64]
@@ -44,6 +46,24 @@ class MarginFile(Strict):
     """All of one checkpoint, by the stem of the constraint file."""
 
     calibrated: dict[str, Margins]
+
+
+def calibrated(checkpoint: Path, weights_sha256: str, stem: str) -> dict[str, float]:
+    """Margin of each constraint of that file by its name, as calibrated with these weights; nothing where they were not."""
+    found = read_margins(checkpoint).get(stem)
+    if found is None or found.weights_sha256 != weights_sha256:
+        return {}
+    return {name: each.margin for name, each in found.constraints.items()}
+
+
+def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
+    """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
+
+    def tight(part: Part) -> Part:
+        margin = margins.get(part.name, 0.0)
+        return part.shift(margin * (part.alpha if isinstance(part, Chain) else 1.0)) if margin else part
+
+    return Constraint(tuple(tight(part) for part in g.parts))
 
 
 def errors(foreseen: Array, executed: Array) -> Array:

@@ -35,6 +35,16 @@ def worst_segment(g: Constraint, x: Array) -> Array:
     return _largest(torch.cat(each, 1) if each else torch.empty(len(x), 0, dtype=torch.float64)).numpy()
 
 
+def unsafe_segments(g: Constraint, x: Array) -> Array:
+    """Number of segments between waypoints [n] on which some g exceeds SAFE; parts that say nothing of segments are left out."""
+    unsafe = torch.zeros(len(x), max(x.shape[1] - 1, 1), dtype=torch.bool)
+    for part in g.parts:
+        rows = part.segment_max(torch.from_numpy(x))
+        if part.spans and rows.shape == unsafe.shape:
+            unsafe |= rows > SAFE
+    return unsafe.sum(1).double().numpy()
+
+
 def distance(x: Array, x_free: Array, columns: Sequence[int], power: float = 1.0) -> Array:
     """Sum over waypoints of |position - position of x_free| ** power [n]; x_free broadcasts (the paper's mean plan)."""
     length: Array = np.linalg.norm((x - x_free)[..., columns], axis=-1)
@@ -99,6 +109,7 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "violation": violation(g, x),
         "worst_waypoint": worst_waypoint(g, x),
         "worst_segment": worst_segment(g, x),
+        "unsafe_segments": unsafe_segments(g, x),
         "safe_waypoints": (worst_waypoint(g, x) <= SAFE).astype(np.float64),
         "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),

@@ -1,7 +1,7 @@
 """From the options of a command to a resolved problem: recipe, preset, method, constraints, checkpoint, pins."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -10,19 +10,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cdiff_cli.baselines import Conditional
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.constraint import Chain, Constraint, Part
-from cdiff_cli.control import Controller
+from cdiff_cli.conditioning import content_sha256, guided
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
-from cdiff_cli.diffusion import KERNELS, Method, Schedule
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
-from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.margins import read_margins
-from cdiff_cli.methods import METHODS, Unconstrained, make_method
+from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
+from cdiff_cli.margins import calibrated, tightened
+from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
 from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
-from cdiff_cli.tasks import ControlTask, Task, load_task
+from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
 
 Array = NDArray[np.float64]
@@ -44,6 +45,7 @@ class Options:
     goal: str | None = None
     kernel: str | None = None
     steps: int | None = None
+    extra_steps: int | None = None
     settings: tuple[str, ...] = ()
     n: int = 10
     seed: int = 0
@@ -72,6 +74,13 @@ class Resolved:
     constraints_path: Path
     checkpoint: Checkpoint | None
     margins: dict[str, float]
+    guided: Denoiser | None = None
+
+    @property
+    def extra_steps(self) -> int:
+        """Frozen steps after the last: those asked for, else the preset's for this method."""
+        asked = self.options.extra_steps
+        return self.preset.extra_steps_for(self.options.method) if asked is None else asked
 
     @property
     def seeds(self) -> list[int]:
@@ -92,7 +101,7 @@ class Resolved:
         """Whether an option departs from the preset."""
         asked = self.options
         changed = (asked.settings, asked.kernel, asked.steps, asked.no_dynamics, asked.execute, asked.warm, asked.action_noise)
-        return any(changed) or asked.margin is not None
+        return any(changed) or asked.extra_steps is not None or asked.margin is not None
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
@@ -104,7 +113,7 @@ class Resolved:
             "options": options | {"settings": list(self.options.settings)},
             "method": {self.options.method: self.settings},
             "kernel": self.kernel,
-            "extra_steps": self.preset.extra_steps,
+            "extra_steps": self.extra_steps,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
@@ -129,6 +138,8 @@ def resolve(options: Options) -> Resolved:
     task = load_task(options.task)
     if options.n < 1:
         raise CdiffError(f"--n: expected at least 1 plan, found {options.n}")
+    if (options.extra_steps or 0) < 0:
+        raise CdiffError(f"--extra-steps: expected 0 or more, found {options.extra_steps}")
     if options.method not in METHODS:
         make_method(options.method, {})
     recipe = load_recipe(options.task)
@@ -170,70 +181,30 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    margins = _margins(options, preset, g, path, checkpoint)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, _tightened(obeyed, margins), start, goal, device)
+    margins = {part.name: options.margin for part in g.parts} if options.margin is not None else {}
+    if options.margin is None and preset.margin and checkpoint is not None:
+        margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins)
+    conditioned = _guided(method, kinds, path, checkpoint) if isinstance(method, Conditional) else None
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
 
 
-def _margins(options: Options, preset: Preset, g: Constraint, path: Path, checkpoint: Checkpoint | None) -> dict[str, float]:
-    """Margin of each constraint by its name: the option's, or the calibrated one; none where the preset wants none."""
-    if options.margin is not None:
-        return {part.name: options.margin for part in g.parts}
-    if not preset.margin or checkpoint is None:
-        return {}
-    found = read_margins(checkpoint.path).get(path.stem)
-    if found is None or found.weights_sha256 != checkpoint.card.weights_sha256:
-        return {}
-    return {name: each.margin for name, each in found.constraints.items()}
-
-
-def _tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
-    """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
-
-    def tight(part: Part) -> Part:
-        margin = margins.get(part.name, 0.0)
-        return part.shift(margin * (part.alpha if isinstance(part, Chain) else 1.0)) if margin else part
-
-    return Constraint(tuple(tight(part) for part in g.parts))
-
-
-def controller(resolved: Resolved) -> Controller:
-    """What acting needs."""
-    problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
-    if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
-        raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
-    execute = preset.execute if options.execute is None else options.execute
-    inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
-    ahead = 1 if inverse is None else inverse.ahead
-    if not 1 <= execute <= problem.horizon - ahead:
-        raise CdiffError(
-            f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
-        )
-    warm = preset.warm if options.warm is None else options.warm
-    if warm is not None and not 0 < warm <= 1:
-        raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
-    if options.action_noise < 0:
-        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
-    return Controller(
-        task=cast(ControlTask, problem.task),
-        denoiser=problem.denoiser,
-        schedule=problem.schedule,
-        frame=checkpoint.frame,
-        inverse=checkpoint.inverse,
-        g=problem.g,
-        enforced=problem.enforced,
-        method=resolved.method,
-        device=problem.device,
-        kernel=resolved.kernel,
-        extra_steps=preset.extra_steps,
-        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
-        temperature=preset.temperature,
-        ahead=ahead,
-        execute=execute,
-        warm=warm,
-        action_noise=options.action_noise,
-    )
+def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Denoiser:
+    """The denoiser of the planner that was trained for these constraints."""
+    if checkpoint is None:
+        raise CdiffError("conditional: this task's score is exact, no planner can be trained for its constraints")
+    task = checkpoint.card.task
+    where = shown(home() / "models" / task / f"conditional-{path.stem}.safetensors")
+    advice = f"train it with `cdiff train --task {task} --conditional {path}`"
+    if not where.exists():
+        raise CheckpointError(f"{where}: no conditional planner for these constraints; {advice}")
+    found = load_checkpoint(where, task, next(checkpoint.net.parameters()).device)
+    if found.card.constraints != content_sha256(kinds):
+        raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
+    if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
+        raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
+    return guided(found.net, method.weight)
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:
