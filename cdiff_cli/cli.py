@@ -3,8 +3,7 @@
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import typer
 from rich.console import Console
 
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.progress import err, progress, training_progress
 from cdiff_cli.runs import METHOD_ORDER
 
 app = typer.Typer(
@@ -21,7 +21,6 @@ app = typer.Typer(
     help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
     epilog="Start with: cdiff plan --method alm",
 )
-err = Console(stderr=True)
 out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width of its own
 
 RUNS = Path("runs")
@@ -47,6 +46,19 @@ Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda")]
 Random = Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each plan")]
 NoDynamics = Annotated[bool, typer.Option("--no-dynamics", help="do not obey the fitted dynamics, whatever the preset says")]
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object instead of the table")]
+Execute = Annotated[int | None, typer.Option(help="control: environment steps a plan is followed [default: the preset's]")]
+Warm = Annotated[
+    float | None, typer.Option(help="control: share of the diffusion steps redone on the last plan [default: from noise]")
+]
+MarginSize = Annotated[
+    float | None, typer.Option("--margin", help="control: tighten each h by this [default: the calibrated margins]")
+]
+ActionNoise = Annotated[float, typer.Option(help="control: disturb each input, standard deviation over half its range")]
+Env = Annotated[list[str] | None, typer.Option(help="control: an option of the environment, as pattern=chaser; may be repeated")]
+Calibrate = Annotated[
+    bool, typer.Option("--calibrate", help="control: measure how far execution leaves the plans, write the margins")
+]
+Confidence = Annotated[float, typer.Option("--level", help="--calibrate: share of episodes that the margins are to cover")]
 RunsFolder = Annotated[Path, typer.Option("--runs", help="where runs are kept")]
 
 
@@ -67,23 +79,6 @@ def reported(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr: call it with (what, done, of how many)."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    tasks: dict[str, Any] = {}
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-
-        def tick(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
-
-        yield tick
-
-
 @app.command()
 @reported
 def train(
@@ -101,8 +96,6 @@ def train(
     runs: RunsFolder = RUNS,
 ) -> None:
     """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors (or conditional-FILE) and its card."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
     from cdiff_cli import training
     from cdiff_cli.checkpoint import install
     from cdiff_cli.recipe import load_recipe, shown
@@ -120,24 +113,7 @@ def train(
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe
     work = runs / f"train-{task}-{name}-{seed}"
-    shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
-    columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
-        data, fit = None, None
-
-        def on_data(done: int, total: int) -> None:
-            nonlocal data
-            data = bar.add_task("demonstrations", total=total, loss="", rate="") if data is None else data
-            bar.update(data, completed=done)
-
-        def on_step(status: training.Status) -> None:
-            nonlocal fit
-            if fit is None:
-                fit = bar.add_task("training", total=status.steps, completed=status.step - 1, loss="", rate="")
-            speed = bar.tasks[-1].speed
-            rate = f"{speed:.1f} steps/s" if speed else ""
-            bar.update(fit, completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
-
+    with training_progress() as (on_data, on_step):
         try:
             checkpoint = training.train(
                 problem,
@@ -167,13 +143,12 @@ def options(values: dict[str, Any]) -> Any:
 
     from cdiff_cli.request import Options
 
-    values = values | {"settings": tuple(values["settings"] or ())}
+    values = values | {name: tuple(values.get(name) or ()) for name in ("settings", "env")}
     return Options(**{f.name: values[f.name] for f in fields(Options) if f.name in values})
 
 
 def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     """Print a run: its table on stdout, where it lies, its picture, what its certificate says."""
-    from cdiff_cli.certificate import summary
     from cdiff_cli.runs import compare
     from cdiff_cli.tables import render
 
@@ -187,7 +162,7 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
         typer.echo(note)
     typer.echo(f"run          {finished.path}")
     typer.echo(f"picture      {finished.picture}")
-    typer.echo(f"certificate  {summary(finished.counts)}")
+    typer.echo(finished.verdict)
 
 
 def transposed(group: Any, names: tuple[str, ...]) -> None:
@@ -273,19 +248,39 @@ def rollout(
     n: Count = 10,
     seed: Seed = 0,
     device: Device = "auto",
+    execute: Execute = None,
+    warm: Warm = None,
+    margin: MarginSize = None,
+    action_noise: ActionNoise = 0.0,
+    env: Env = None,
+    calibrate: Calibrate = False,
+    level: Confidence = 0.95,
     video: Annotated[str | None, typer.Option(help="gif or mp4 of the first episode")] = None,
     runs: RunsFolder = RUNS,
     as_json: AsJson = False,
 ) -> None:
-    """Plan, then follow the plans in the simulator; scores the executed path against the constraints."""
+    """Plan and execute in the simulator, scoring what was executed against the constraints: mazes follow one plan, control
+    tasks (hopper, swimmer, ball-run) plan anew at every step.
+    """
     given = locals()
     if video not in (None, "gif", "mp4"):
         raise CdiffError(f"--video: expected gif or mp4, found {video}")
-    from cdiff_cli.experiment import rollout_run
     from cdiff_cli.request import resolve
-    from cdiff_cli.runs import QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
+    from cdiff_cli.runs import CONTROL_TABLE, QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
 
-    resolved = resolve(options(given))
+    resolved = resolve(options(given | ({"margin": 0.0} if calibrate else {})))
+    if resolved.recipe.frame == "relative":
+        from cdiff_cli import closed_loop
+
+        with progress() as tick:
+            if calibrate:
+                typer.echo(closed_loop.calibrated_text(*closed_loop.calibrate(resolved, tick, level)))
+                return
+            finished = closed_loop.control_run(resolved, runs, tick, video)
+        finish(finished, CONTROL_TABLE, as_json)
+        return
+    from cdiff_cli.experiment import rollout_run
+
     warn_of_speed(resolved)
     with progress() as tick:
         finished = rollout_run(resolved, runs, tick, video)

@@ -64,6 +64,10 @@ class Schedule:
         keep = list(accumulate(wanted, lambda before, i: max(before + 1, i), initial=0))  # each step once; convex, so it ends at n
         return Schedule(tuple(self.alpha_bar[i] for i in keep), tuple(self.t[i] for i in keep))
 
+    def until(self, n_steps: int) -> "Schedule":
+        """The last steps alone, those nearest the data."""
+        return Schedule(self.alpha_bar[: n_steps + 1], self.t[: n_steps + 1])
+
 
 def ddpm(x: Traj, x0: Traj, z: Traj, a: float, b: float, previous: Previous | None = None) -> Traj:  # noqa: ARG001
     """Posterior q(x_{t-1} | x_t, x_0) (Ho et al., 2020, Eq. 7): Eq. 4 of the paper with the posterior's variance."""
@@ -168,14 +172,16 @@ def sample(
     *,
     kernel: Kernel = ddpm,
     extra_steps: int = 0,
+    first: Traj | None = None,
     on_step: Callable[[int, Step, Traj], None] | None = None,
 ) -> Traj:
     """Plans x_0 in normalised coordinates [batch, horizon, dim].
 
+    first        x_T, the schedule's noisiest; drawn where None
     extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
     on_step      called with the number of network calls so far, the step and x_{t-1}
     """
-    x = pins.paint(noise())
+    x = pins.paint(noise() if first is None else first)
     state = method.init(x, g)
     used: Previous | None = None
     for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):

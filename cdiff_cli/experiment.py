@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli import figures, metrics
-from cdiff_cli.certificate import Saved, certificate
+from cdiff_cli.certificate import Saved, certificate, summary
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.planning import Plans, Rollout, follow, plan
@@ -29,12 +29,13 @@ Tick = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is on disk, and what the command prints of it."""
+    """A run that is on disk, and what the command prints of it: its rows, its picture, its verdict in a line and in numbers."""
 
     path: Path
     rows: list[Row]
     picture: Path
     counts: dict[str, int | None]
+    verdict: str
     notes: tuple[str, ...] = ()
 
 
@@ -50,7 +51,7 @@ def plan_run(resolved: Resolved, root: Path, tick: Tick, *, name: str | None = N
             _plan_pictures(run.path, resolved, plans, free)
         if pictures and plans.chain is not None and resolved.problem.horizon == 1:
             notes.append(_chain_figure(run.path, resolved, plans))
-    return Finished(run.path, rows, run.path / "plan.png", counts, tuple(notes))
+    return Finished(run.path, rows, run.path / "plan.png", counts, f"certificate  {summary(counts)}", tuple(notes))
 
 
 def rollout_run(
@@ -84,7 +85,7 @@ def rollout_run(
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
             tick("video", 1, 1)
-    return Finished(run.path, rows, run.path / "rollout.png", counts)
+    return Finished(run.path, rows, run.path / "rollout.png", counts, f"certificate  {summary(counts)}")
 
 
 def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
@@ -110,8 +111,7 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )
-    twice = resolved.guided is not None and resolved.settings["weight"] != 1.0  # with and without the condition
-    return replace(plans, calls=2 * plans.calls) if twice else plans, free
+    return replace(plans, calls=resolved.calls_a_step * plans.calls), free
 
 
 def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:

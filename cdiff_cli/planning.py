@@ -68,11 +68,11 @@ class Plans:
     u: Array | None = None
 
 
-def network_denoiser(net: torch.nn.Module) -> Denoiser:
+def network_denoiser(net: torch.nn.Module, limit: float = 1.0) -> Denoiser:
     """x_t, t -> the network's clean estimate, clipped to the data's limits."""
 
     def clean(x: Traj, t: int) -> Traj:
-        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-1.0, 1.0)
+        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-limit, limit)
 
     return clean
 
@@ -234,7 +234,7 @@ def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array
     todo, warm = torch.arange(len(z)), None
     x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
     for tolerance in (5e-4, 5e-5, 5e-6):
-        near, warm = project_from(g, z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
+        near, warm = project_from(g.take(todo), z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
         assert warm is not None
         u[todo] = torch.clamp(warm.u, dynamics.low, dynamics.high)
         x[todo] = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), u[todo]))

@@ -104,6 +104,10 @@ class Preset(Strict):
     polish      project the finished plans once more, in float64
     safety      where constraints hold that do not say so themselves
     dynamics    obey the checkpoint's linear dynamics too
+    temperature factor on all noise
+    execute     environment steps a plan is followed, in control
+    warm        in control, share of the diffusion steps done again on the last plan; None: each plan from noise
+    margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
     methods     each method's constants by its name
     """
 
@@ -114,6 +118,10 @@ class Preset(Strict):
     polish: bool = False
     safety: Literal["waypoints", "segments"] = "waypoints"
     dynamics: bool = False
+    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
+    execute: Positive = 1
+    warm: Annotated[float, Field(gt=0, le=1)] | None = None
+    margin: bool = False
     methods: dict[str, dict[str, Any]] = {}
 
     def extra_steps_for(self, method: str) -> int:

@@ -18,6 +18,7 @@ from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
+from cdiff_cli.margins import calibrated, tightened
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
@@ -26,6 +27,7 @@ from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
 
 Array = NDArray[np.float64]
+RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
 VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
@@ -50,6 +52,11 @@ class Options:
     device: str = "auto"
     random: bool = False
     no_dynamics: bool = False
+    execute: int | None = None
+    warm: float | None = None
+    margin: float | None = None
+    action_noise: float = 0.0
+    env: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,7 @@ class Resolved:
     kinds: Sequence[Kind]
     constraints_path: Path
     checkpoint: Checkpoint | None
+    margins: dict[str, float]
     guided: Denoiser | None = None
 
     @property
@@ -73,6 +81,11 @@ class Resolved:
         """Frozen steps after the last: those asked for, else the preset's for this method."""
         asked = self.options.extra_steps
         return self.preset.extra_steps_for(self.options.method) if asked is None else asked
+
+    @property
+    def calls_a_step(self) -> int:
+        """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
+        return 2 if self.guided is not None and self.settings["weight"] != 1.0 else 1
 
     @property
     def seeds(self) -> list[int]:
@@ -92,11 +105,13 @@ class Resolved:
     def _changed(self) -> bool:
         """Whether an option departs from the preset."""
         asked = self.options
-        return bool(asked.settings or asked.kernel or asked.steps or asked.extra_steps is not None or asked.no_dynamics)
+        changed = (asked.settings, asked.kernel, asked.steps, asked.no_dynamics, asked.execute, asked.warm, asked.action_noise)
+        return any(changed) or asked.extra_steps is not None or asked.margin is not None
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
         options = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.options).items()}
+        options["env"] = list(self.options.env)
         card = self.checkpoint.card if self.checkpoint else None
         pins = {name: None if s is None else s.tolist() for name, s in self._pins().items()}
         return {
@@ -107,6 +122,7 @@ class Resolved:
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
+            "margins": self.margins,
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -151,7 +167,8 @@ def resolve(options: Options) -> Resolved:
     else:
         where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")
         checkpoint = load_checkpoint(where, task.name, device)
-        denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
+        limit = 1.0 if checkpoint.frame is None else RELATIVE_LIMIT
+        denoiser, normaliser = network_denoiser(checkpoint.net, limit), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     kinds, g = load_constraints(path, task.name, task.layout, checkpoint.dynamics if checkpoint else None)
@@ -169,10 +186,13 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
+    margins = {part.name: options.margin for part in g.parts} if options.margin is not None else {}
+    if options.margin is None and preset.margin and checkpoint is not None:
+        margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
     conditioned = _guided(method, kinds, path, checkpoint) if isinstance(method, Conditional) else None
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, conditioned)
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
 
 
 def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Denoiser:
@@ -189,7 +209,7 @@ def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: 
         raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
     if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
         raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
-    return guided(found.net, method.weight)
+    return guided(found.net, method.weight, 1.0 if found.frame is None else RELATIVE_LIMIT)
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:

@@ -64,6 +64,14 @@ COLUMNS = {
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
+    "plan_violation": Column("plan violation / g", 4, "violation of a plan, mean over those of the episode"),
+    "safe_plans": Column("safe plans", 3, "share of the episode's plans with no g above 1e-6 at a waypoint"),
+    "fell": Column("fell", 2, "share of episodes that the environment ended early"),
+    "diverged": Column("diverged", 2, "share of episodes whose plans or states were no longer finite"),
+    "contacts": Column("contacts", 2, "environment steps in contact with the obstacle"),
+    "saturation": Column("saturation / %", 1, "share of executed inputs that are at their bounds"),
+    "latency_ms": Column("latency / ms", 2, "median wall time of planning at a control step, all episodes at once"),
+    "latency_p95": Column("latency 95 % / ms", 2, "its 95 % quantile"),
     "steps": Column("steps", 0, "environment steps"),
     "success": Column("success", 2, "share of episodes that end within the environment's success radius of the goal"),
     "goal_distance": Column("goal distance / m", 3, "distance to the goal at the end"),
@@ -96,6 +104,21 @@ SAFETY_TABLE = (
     "wall",
     "effort",
     "distance",
+)
+CONTROL_TABLE = (
+    "reward",
+    "violation_rate",
+    "executed_violation",
+    "executed_worst",
+    "safe_executed",
+    "plan_violation",
+    "fell",
+    "contacts",
+    "saturation",
+    "calls",
+    "latency_ms",
+    "latency_p95",
+    "overhead",
 )
 PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
 

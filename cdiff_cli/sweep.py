@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -137,13 +138,16 @@ def run_jobs(
 
 def run_job(job: Job, root: Path, folder: Path) -> Outcome:
     """One run, with `folder` as the working directory, wherever the worker was started."""
+    from cdiff_cli.closed_loop import control_run
     from cdiff_cli.experiment import plan_run, rollout_run
 
     began = time.perf_counter()
     try:
         with contextlib.chdir(folder), _one_thread():
             resolved = resolve(job.options)
-            (rollout_run if job.rollout else plan_run)(resolved, root, lambda *_: None, name=job.name, pictures=False)
+            execute = control_run if resolved.recipe.frame == "relative" else rollout_run
+            make = cast(Any, execute if job.rollout else plan_run)
+            make(resolved, root, lambda *_: None, name=job.name, pictures=False)
         return Outcome(job, time.perf_counter() - began)
     except CdiffError as error:
         return Outcome(job, time.perf_counter() - began, str(error))

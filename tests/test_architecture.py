@@ -14,6 +14,7 @@ PACKAGE = ROOT / "cdiff_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RANKS = {
     "errors": 0,
+    "progress": 0,
     "inference": 0,
     "config": 1,
     "levels": 1,
@@ -36,6 +37,10 @@ RANKS = {
     "frames": 8,
     "inverse": 8,
     "checkpoint": 9,
+    "margins": 3,
+    "control": 11,
+    "control_figures": 12,
+    "closed_loop": 15,
     "planning": 10,
     "training": 10,
     "figures": 11,
@@ -47,8 +52,8 @@ RANKS = {
     "explain": 12,
     "verify": 12,
     "experiment": 14,
-    "sweep": 15,
-    "cli": 16,
+    "sweep": 16,
+    "cli": 17,
 }
 """A room may import only rooms of a lower rank (the files within tasks/ are one room)."""
 
