@@ -261,7 +261,7 @@ class Difference:
 
 
 def differences(rows: Sequence[Row], reference: str, metrics: Sequence[str], test: Test = "wilcoxon") -> list[Difference]:
-    """Every other method against the reference where both have rows of the same seeds."""
+    """Every other method against the reference where both have rows of the same seeds; metrics that nowhere differ are left out."""
     groups, found = newest(rows), []
     for name in metrics:
         family = []
@@ -274,6 +274,8 @@ def differences(rows: Sequence[Row], reference: str, metrics: Sequence[str], tes
             if method != reference and d and name not in COSTS:
                 p = paired_p(d, test, COLUMNS[name].share)
                 family.append(Difference(key, name, len(d), statistics.fmean(d), bootstrap(d), p, p))
+        if all(each.mean == 0 and each.p == 1 for each in family):
+            continue
         corrected = holm([each.p for each in family])
         found += [replace(each, holm=p) for each, p in zip(family, corrected, strict=True)]
     return found

@@ -132,8 +132,12 @@ def run_jobs(
     from joblib import Parallel, delayed
 
     with _backend(backend, address):
-        runs = (delayed(run_job)(job, root.absolute(), Path.cwd()) for job in jobs)
-        yield from Parallel(n_jobs=workers, batch_size=1, pre_dispatch="2*n_jobs", return_as="generator_unordered")(runs)
+        runs = [delayed(run_job)(job, root.absolute(), Path.cwd()) for job in jobs]
+        if backend != "ray":
+            yield from Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")(runs)
+            return
+        for first in range(0, len(runs), 4 * workers):  # its joblib backend hands results back all at once alone
+            yield from Parallel(n_jobs=workers, batch_size=1)(runs[first : first + 4 * workers])
 
 
 def run_job(job: Job, root: Path, folder: Path) -> Outcome:

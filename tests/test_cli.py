@@ -252,6 +252,13 @@ OPTIONS = {
     "start too short": (["--start", "1"], ["--start: y missing"]),
     "no plans": (["--n", "0"], ["at least 1"]),
     "negative extra steps": (["--extra-steps", "-1"], ["--extra-steps: expected 0 or more, found -1"]),
+    "no planner for the constraints": (
+        ["--method", "conditional", "--constraints", "constraints/maze2d-umaze-disc.yaml"],
+        [
+            "no conditional planner for these constraints",
+            "cdiff train --task maze2d-umaze --conditional constraints/",
+        ],
+    ),
     "unknown variant": (
         ["--method", "safediffuser", "--set", "variant=rose"],
         ["safediffuser.variant: expected one of ros, res, tvs"],

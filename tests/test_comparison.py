@@ -54,6 +54,13 @@ def test_holm_corrects_all_tests_of_one_metric():
     assert [each.holm for each in found] == pytest.approx([3 * 2 / 2**6] * 3)
 
 
+def test_a_metric_that_nowhere_differs_is_left_out():
+    assert (
+        differences([*rows("projected", steps=5.0), *rows("alm", 1.0, steps=5.0)], "alm", ["steps", "distance"])[0].metric
+        == "distance"
+    )
+
+
 @pytest.mark.parametrize("style", FORMATS)
 def test_every_format_holds_the_differences(style):
     found = differences([*rows("projected", 1.0), *rows("alm")], "alm", ["distance"])
