@@ -196,15 +196,20 @@ def _powers(gamma: float, n: int, like: Tensor) -> Tensor:
 
 
 def _nearest_under(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int) -> Rows:
-    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v >= low, v_k = h_k outside first to last, by its dual (_by_flipping)."""
+    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_flipping). Where that asks for
+    less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.
+    """
     one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
-    D, h64, way = chain.rows_of(one).T, h.double(), 1 / weight.double()[..., free]
-    v = h64.clone()
-    v[:, free] += _by_flipping(D[:, free], h64 @ D.T, way)
+    D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)
+    v[:, free] += _by_flipping(D[:, free], v @ D.T, 1 / weight.double()[..., free])
     if low is not None and bool((v < low).any()):
-        D, b = torch.cat((D, one[free])), torch.cat((h64 @ D.T, (h64 - low)[:, free]), 1)
-        v = h64.clone()
-        v[:, free] += _by_flipping(D[:, free], b, way)
+        order = len(chain.coefficients) - 1
+        v = torch.maximum(v, low)
+        for k in range(max(first, order), last):
+            due = sum(
+                (-weight * v[:, k - order + at] for at, weight in enumerate(chain.coefficients[:-1])), torch.zeros_like(v[:, 0])
+            )
+            v[:, k] = torch.maximum(v[:, k], due)
     return v.to(h)
 
 

@@ -45,7 +45,7 @@ class Checkpoint:
 def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:
     """A network of that size, its weights drawn from the global generator."""
     if isinstance(network, MlpSpec):
-        return ResidualMlp(dim, horizon, network.width, network.depth)
+        return ResidualMlp(dim, horizon, network.width, network.depth, network.conditions)
     return TemporalUnet(dim, **network.model_dump(exclude={"kind"}))
 
 

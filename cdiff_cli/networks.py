@@ -23,6 +23,8 @@ class TemporalUnet(nn.Module):
              trajectory made at each level on the way up and fed back there: walls are sharp functions of the position, which
              convolutions of z alone learn slowly
 
+    conditions  entries of a label that the estimate can be conditioned on (conditioning.py)
+
     dim         number of coordinates of a waypoint
     width       channels of the first level
     multipliers channels of each level, in units of width; the horizon must divide by patch * 2^(levels - 1)
@@ -38,6 +40,7 @@ class TemporalUnet(nn.Module):
         *,
         patch: int = 1,
         octaves: int = 0,
+        conditions: int = 0,
         ends: tuple[int, ...] = (0, -1),
         ramp: int = 16,
     ) -> None:
@@ -75,19 +78,20 @@ class TemporalUnet(nn.Module):
             self.recall = nn.ModuleList(nn.Conv1d(dim * (1 + 2 * octaves), c, 1) for c in reversed(channels))
             self.last = ResidualBlock(channels[0], channels[0], width)
         self.head = nn.Sequential(ConvBlock(channels[0], channels[0]), nn.Conv1d(channels[0], dim, 1))
+        self.condition = _condition(conditions, width)
 
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+    def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
         """The clean estimate [batch, horizon, dim] of the noisy trajectories x at the diffusion steps t [batch]."""
-        return self.estimates(x, t)[-1]
+        return self.estimates(x, t, condition)[-1]
 
-    def estimates(self, x: Tensor, t: Tensor) -> list[Tensor]:
+    def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
         """Estimates of the clean trajectory, of rising resolution [batch, horizon / k, dim]: the last one is the output, the
         others (none without octaves) estimate means over k waypoints and are trained along.
         """
         pinned = [x[:, [end]] for end in self.ends]
         features = [torch.cat((state, *self._fourier(state)), -1).expand(-1, x.shape[1], -1) for state in pinned]
         h = self.stem(torch.cat((x, *features), -1).transpose(1, 2))
-        step = self.embed(t)
+        step = self.embed(t) if condition is None else self.embed(t) + self.condition(condition)
         skips, guesses = [], []
 
         def look(level: int, h: Tensor) -> Tensor:
@@ -140,7 +144,7 @@ class ResidualMlp(nn.Module):
     width, depth   channels and number of the blocks
     """
 
-    def __init__(self, dim: int, horizon: int, width: int = 256, depth: int = 3) -> None:
+    def __init__(self, dim: int, horizon: int, width: int = 256, depth: int = 3, conditions: int = 0) -> None:
         nn.Module.__init__(self)
         self.embed = nn.Sequential(SinusoidalStep(64), nn.Linear(64, width), nn.SiLU(), nn.Linear(width, width))
         self.stem = nn.Linear(horizon * dim, width)
@@ -148,14 +152,16 @@ class ResidualMlp(nn.Module):
             nn.ModuleList((nn.LayerNorm(width), nn.Linear(width, width), nn.Linear(width, width))) for _ in range(depth)
         )
         self.head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, (horizon - 1) * dim))
+        self.condition = _condition(conditions, width)
 
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+    def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
         """The clean estimate [batch, horizon, dim] of the noisy windows x at the diffusion steps t [batch]."""
-        return self.estimates(x, t)[-1]
+        return self.estimates(x, t, condition)[-1]
 
-    def estimates(self, x: Tensor, t: Tensor) -> list[Tensor]:
+    def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
         """As TemporalUnet.estimates; there is one."""
         h, step = self.stem(x.flatten(1)), self.embed(t)
+        step = step if condition is None else step + self.condition(condition)
         for norm, inward, outward in cast(Any, self.blocks):
             h = h + outward(F.silu(inward(norm(h)) + step))
         ahead = self.head(h).to(x).unflatten(1, (x.shape[1] - 1, x.shape[2]))
@@ -185,6 +191,14 @@ class InverseDynamics(nn.Module):
 
     def forward(self, x: Tensor, after: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(self.raw(x, after), cast(Tensor, self.low)), cast(Tensor, self.high))
+
+
+def _condition(conditions: int, width: int) -> nn.Module:
+    """Labels [batch, conditions] into the embedding of the diffusion step: linear, so that zeros mean none, and zero at first."""
+    layer = nn.Linear(conditions, width, bias=False) if conditions else nn.Identity()
+    if isinstance(layer, nn.Linear):
+        nn.init.zeros_(layer.weight)
+    return layer
 
 
 def _spline(knots: Tensor, patch: int) -> Tensor:

@@ -10,6 +10,7 @@ from cdiff_cli.config import Strict, load
 from cdiff_cli.errors import CdiffError
 
 Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
 
 
 class NetworkSpec(Strict):
@@ -20,6 +21,7 @@ class NetworkSpec(Strict):
     multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
     patch: Literal[1, 2, 4, 8, 16] = 1
     octaves: Annotated[int, Field(ge=0, le=10)] = 0
+    conditions: Count = 0
 
     @property
     def stride(self) -> int:
@@ -33,6 +35,7 @@ class MlpSpec(Strict):
     kind: Literal["mlp"]
     width: Positive = 256
     depth: Positive = 3
+    conditions: Count = 0
 
     @property
     def stride(self) -> int:
@@ -55,7 +58,11 @@ class InverseSpec(Strict):
 
 
 class TrainSpec(Strict):
-    """One way to train; the defaults are those of the small recipe."""
+    """One way to train; the defaults are those of the small recipe.
+
+    begin     the recipe whose checkpoint is trained on, None: from the beginning
+    dropout   of conditional planners, share of the windows shown without their label
+    """
 
     network: NetworkSpec | MlpSpec = NetworkSpec()
     steps: Positive
@@ -69,6 +76,8 @@ class TrainSpec(Strict):
     trips: Annotated[float, Field(ge=0, le=1)] = 0.5
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
+    begin: str | None = None
+    dropout: Annotated[float, Field(gt=0, lt=1)] = 0.25
     inverse: InverseSpec | None = None
 
 
@@ -91,19 +100,32 @@ class Preset(Strict):
     """How to sample.
 
     steps       network calls to respace the schedule to; None: as trained
+    extra_steps further steps with t frozen and no noise; extra_steps_of: the number of a method that has its own
     polish      project the finished plans once more, in float64
     safety      where constraints hold that do not say so themselves
     dynamics    obey the checkpoint's linear dynamics too
+    temperature factor on all noise
+    execute     environment steps a plan is followed, in control
+    warm        in control, share of the diffusion steps done again on the last plan; None: each plan from noise
+    margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
     methods     each method's constants by its name
     """
 
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
     steps: Positive | None = None
-    extra_steps: Annotated[int, Field(ge=0)] = 0
+    extra_steps: Count = 0
+    extra_steps_of: dict[str, Count] = {}
     polish: bool = False
     safety: Literal["waypoints", "segments"] = "waypoints"
     dynamics: bool = False
+    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
+    execute: Positive = 1
+    warm: Annotated[float, Field(gt=0, le=1)] | None = None
+    margin: bool = False
     methods: dict[str, dict[str, Any]] = {}
+
+    def extra_steps_for(self, method: str) -> int:
+        return self.extra_steps_of.get(method, self.extra_steps)
 
 
 class Recipe(Strict):
@@ -144,6 +166,7 @@ class Card(Strict):
     """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
 
     inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
+    constraints   hash of the constraints that a conditional planner was trained for; None of the others
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -167,6 +190,7 @@ class Card(Strict):
     data: dict[str, float]
     linear: float | None = None
     inverse: dict[str, float] | None = None
+    constraints: str | None = None
 
 
 def home() -> Path:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field, WithJsonSchema, WrapValidator, model_validator
+from pydantic import Field, PlainSerializer, WithJsonSchema, WrapValidator, model_validator
 from torch import Tensor
 
 from cdiff_cli.config import Strict
@@ -23,6 +23,9 @@ Safety = Annotated[
 ]
 
 
+_AS_IT_IS = PlainSerializer(lambda value: value, return_type=float | str)
+
+
 def _or_name(value: Any, number: Callable[[Any], float]) -> Any:
     return value if isinstance(value, str) else number(value)
 
@@ -32,9 +35,9 @@ def _schema(**number: Any) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [{"type": "number"} | number, name]})
 
 
-Quantity = Annotated[Number, WrapValidator(_or_name), _schema()]
+Quantity = Annotated[Number, WrapValidator(_or_name), _AS_IT_IS, _schema()]
 """A number, or the name of an observed quantity: text, until it is observed."""
-PositiveQuantity = Annotated[PositiveNumber, WrapValidator(_or_name), _schema(exclusiveMinimum=0)]
+PositiveQuantity = Annotated[PositiveNumber, WrapValidator(_or_name), _AS_IT_IS, _schema(exclusiveMinimum=0)]
 Quantities = Annotated[dict[str, Quantity], Field(min_length=1)]
 Velocity = Annotated[
     Quantities | None,
@@ -138,7 +141,7 @@ class Quadratic(Strict):
         names = [name for name in layout if name in self.centre]
         lengths = {name: self.semi_axes[name] if self.semi_axes else self.radius for name in names}
         axes, centre = vector(lengths, names, seen), vector(self.centre, names, seen)
-        which = torch.stack([vector({name: 1.0}, layout) for name in names])
+        which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
         m = axes.amin(-1)
         if self.form == "distance":
             return Ellipsoid(which, centre, axes, m, side)
@@ -210,7 +213,10 @@ def names_in(numbers: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
 
 def vector(values: Mapping[str, Any], layout: Layout, seen: Seen = NOTHING) -> Tensor:
     """The numbers in the layout's order, 0 where there is none: [dim], or [batch, 1, dim] where some are observed."""
-    numbers = [_filled(values.get(name, 0.0), seen) for name in layout]
+    wanted = [values.get(name, 0.0) for name in layout]
+    if not any(isinstance(value, str) for value in wanted):
+        return torch.tensor(wanted, dtype=torch.float64)
+    numbers = [_filled(value, seen) for value in wanted]
     shape = max((number.shape for number in numbers), key=len)
     return torch.stack([number.expand(shape) for number in numbers], -1)
 

@@ -13,18 +13,23 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cdiff_cli.checkpoint import Checkpoint, Network, build, read_safetensors, save_checkpoint, write_safetensors
+from cdiff_cli.checkpoint import Checkpoint, Network, build, load_checkpoint, read_safetensors, save_checkpoint, write_safetensors
+from cdiff_cli.conditioning import LABELS, Condition, drop
 from cdiff_cli.data import Array, Normaliser, Progress, Windows, demonstrations, digest, load_dataset, load_inputs
 from cdiff_cli.diffusion import Schedule, Weighing, training_loss
 from cdiff_cli.dynamics import LinearDynamics, fit
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.frames import Frame
 from cdiff_cli.inverse import fit_inverse
-from cdiff_cli.recipe import Recipe, TrainSpec, shown
+from cdiff_cli.recipe import Recipe, TrainSpec, home, shown
 from cdiff_cli.tasks import ControlTask, Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
 LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
+
+
+Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor | None]]
+"""(how many, generator) -> windows and, of a conditional planner, their labels."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ def train(
     work: Path,
     resume: bool = False,
     dataset: str | None = None,
+    condition: Condition | None = None,
     save_every: int = 500,
     on_data: Progress | None = None,
     on_step: Callable[[Status], None] | None = None,
@@ -66,19 +72,26 @@ def train(
 
     work holds state.safetensors, written every save_every steps and on interruption; resume goes on from there and, on one
     CPU with as many threads, ends with the same bits as an uninterrupted run.
+
+    condition   constraints to condition the planner on; the recipe's network must have room for their labels
     """
     if not recipe.train:
         raise CdiffError(f"{task.name} needs no training: its score is exact")
     if size not in recipe.train:
         raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
     spec = recipe.train[size]
+    if spec.network.conditions != (LABELS if condition else 0):
+        wanted = f"conditions: {LABELS} in its network" if condition else "--conditional FILE"
+        raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or add it')
     asked = recipe.demonstrations
     episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
-    data = Data.of(task, recipe, spec, episodes)
+    data = Data.of(task, recipe, spec, episodes, condition)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
         state.load(work / "state.safetensors")
+    elif spec.begin:
+        state.begin(load_checkpoint(shown(home() / "models" / task.name / f"{spec.begin}.safetensors"), task.name, device))
     schedule, pinned = Schedule.cosine(recipe.n_steps), data.pinned.to(device)
     work.mkdir(parents=True, exist_ok=True)
     began = time.monotonic() - state.wall_s
@@ -104,7 +117,7 @@ def train(
         inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, hidden, seed)
     card = {
         "task": task.name,
-        "recipe": size,
+        "recipe": size if condition is None else f"conditional-{condition.name}",
         "horizon": recipe.horizon,
         "n_steps": recipe.n_steps,
         "network": spec.network.model_dump(mode="json"),
@@ -122,6 +135,7 @@ def train(
         "data": data_statistics(task, episodes, recipe.horizon),
         "linear": None if dynamics is None else round(dynamics[1], 6),
         "inverse": explained,
+        "constraints": condition.sha256 if condition else None,
     }
     tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()} | data.tensors()
     if inverse is not None:
@@ -159,25 +173,33 @@ class Data:
     normaliser: Normaliser
     frame: Frame | None
     pinned: Tensor
+    condition: Condition | None
+    dropout: float
 
     @classmethod
-    def of(cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array]) -> "Data":
+    def of(
+        cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array], condition: Condition | None = None
+    ) -> "Data":
         pinned = end_pins(recipe.horizon, len(task.layout))
         if recipe.frame == "relative":
             windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
             frame = Frame.fit(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
             pinned[-1] = False
-            return cls(windows, frame.state, frame, pinned)
+            return cls(windows, frame.state, frame, pinned, condition, spec.dropout)
         normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)
         windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
         if task.velocities:
             columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
             windows = windows.favour_trips(spec.trips, *columns)
-        return cls(windows, normaliser, None, pinned)
+        return cls(windows, normaliser, None, pinned, condition, spec.dropout)
 
-    def draw(self, n: int, generator: torch.Generator) -> Tensor:
-        x = self.windows.draw(n, generator)
-        return x if self.frame is None else self.frame.encode(x)
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """n windows and, of a conditional planner, their labels."""
+        x, label = self.windows.draw(n, generator), None
+        if self.condition is not None:
+            states = x if self.frame is not None else self.normaliser.decode(x.double())
+            label = drop(self.condition.label(states), self.dropout, generator)
+        return x if self.frame is None else self.frame.encode(x), label
 
     def tensors(self) -> dict[str, Tensor]:
         """What a checkpoint keeps of them."""
@@ -221,7 +243,16 @@ class _Fit:
         generator = torch.Generator().manual_seed(seed)
         return cls(net, ema, optimiser, generator, spec, recipe.horizon, recipe.n_steps, device, seed, data_sha256)
 
-    def advance(self, draw: Callable[[int, torch.Generator], Tensor], schedule: Schedule, pinned: Tensor) -> float:
+    def begin(self, base: Checkpoint) -> None:
+        """Go on from the weights of a finished checkpoint of the same data and, but for the labels, the same network."""
+        if base.card.data_sha256 != self.data_sha256:
+            raise CheckpointError(f"{base.path}: trained on other demonstrations; train it again, then this one")
+        if base.card.network.model_copy(update={"conditions": self.spec.network.conditions}) != self.spec.network:
+            raise CheckpointError(f"{base.path}: its network is not the one of this recipe, which begins from it; mend recipe.yaml")
+        for net in (self.net, self.ema):
+            net.load_state_dict(net.state_dict() | base.net.state_dict())
+
+    def advance(self, draw: Draw, schedule: Schedule, pinned: Tensor) -> float:
         """One optimiser step; returns the loss."""
         spec, loss_value, mse_value = self.spec, 0.0, 0.0
         weighing = Weighing(spec.smoothness, spec.emphasis)
@@ -230,8 +261,9 @@ class _Fit:
         self.optimiser.zero_grad()
         self.drawn_from = self.generator.get_state()
         for _ in range(spec.accumulate):
-            x0 = draw(spec.batch, self.generator).to(self.device)
-            loss, mse = training_loss(self.net, schedule, x0, pinned, weighing, self.generator, spec.bf16)
+            x0, label = draw(spec.batch, self.generator)
+            x0, label = x0.to(self.device), None if label is None else label.to(self.device)
+            loss, mse = training_loss(self.net, schedule, x0, pinned, weighing, self.generator, spec.bf16, label)
             (loss / spec.accumulate).backward()  # type: ignore[no-untyped-call]
             loss_value, mse_value = loss_value + loss.item() / spec.accumulate, mse_value + mse.item() / spec.accumulate
         if not math.isfinite(loss_value):
