@@ -5,15 +5,15 @@ trajectory: at every waypoint, or as a discrete control barrier function along i
 an exact form; gradients are written out, so that a method pays for a few vector operations and no autograd graph.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import ClassVar, Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.levels import Level, Quadric, moved, segment_max
+from cdiff_cli.levels import Framed, Level, Quadric, moved, segment_max, take
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -64,6 +64,10 @@ class Part(Protocol):
         """The same part of z, x = centre + scale * z; the rows keep their values and units."""
         ...
 
+    def take(self, which: Tensor) -> Self:
+        """The same part of some plans of the batch alone."""
+        ...
+
     def to(self, like: Tensor) -> Self:
         """The same part with its numbers in the dtype and on the device of `like`."""
         ...
@@ -100,6 +104,9 @@ class Waypoints:
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Waypoints":
         return replace(self, level=self.level.pull_back(centre, scale))
 
+    def take(self, which: Tensor) -> "Waypoints":
+        return replace(self, level=take(self.level, which))
+
     def to(self, like: Tensor) -> "Waypoints":
         return replace(self, level=moved(self.level, like))
 
@@ -109,7 +116,7 @@ class Waypoints:
     def segment_max(self, x: Traj) -> Rows:
         if x.shape[1] < 2:
             return self(x)
-        return segment_max(self.level, x[:, :-1], x[:, 1:])
+        return segment_max(self.level, x)
 
     def on_segments(self) -> "tuple[Part, ...]":
         return (self if self.level.convex else _segments(self.name, self.level),)
@@ -131,20 +138,21 @@ class Segments:
         return self.segment_max(x)[:, : x.shape[1] - 1]
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        s = self.level.worst(x[:, :-1], x[:, 1:])[..., None]
-        at = x[:, :-1] + s * (x[:, 1:] - x[:, :-1])
-        slope = self.level.gradient(at)
+        at = self.level.between(x, self.level.worst(x))
 
         def pull(w: Rows) -> Traj:
             out = torch.zeros_like(x)
-            out[:, :-1] += (1 - s) * w[..., None] * slope
-            out[:, 1:] += s * w[..., None] * slope
+            out[:, :-1] += w[..., None] * at.back
+            out[:, 1:] += w[..., None] * at.on
             return out
 
-        return self.level(at), pull, 2 * ((1 - s) ** 2 + s**2)[..., 0] * self.level.size(at)
+        return at.value, pull, 2 * at.size
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Segments":
         return replace(self, level=self.level.pull_back(centre, scale))
+
+    def take(self, which: Tensor) -> "Segments":
+        return replace(self, level=take(self.level, which))
 
     def to(self, like: Tensor) -> "Segments":
         return replace(self, level=moved(self.level, like))
@@ -161,7 +169,7 @@ class Segments:
 
 def _segments(name: str, level: Level) -> Segments:
     """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
-    ball = level.ball() if isinstance(level, Quadric) else None
+    ball = level.ball() if isinstance(level, Quadric | Framed) else None
     return Segments(name, ball or level)
 
 
@@ -197,6 +205,9 @@ class Chain:
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Chain":
         return replace(self, level=self.level.pull_back(centre, scale))
 
+    def take(self, which: Tensor) -> "Chain":
+        return replace(self, level=take(self.level, which))
+
     def to(self, like: Tensor) -> "Chain":
         return replace(self, level=moved(self.level, like))
 
@@ -217,21 +228,27 @@ class Chain:
 class Opaque:
     """Rows of which only the function is known: differentiated by autograd, projected by sequential linearisation.
 
-    fn      trajectory in environment units -> rows, differentiable
-    count   number of rows at a horizon
+    fn             trajectory in environment units -> rows, differentiable
+    count          number of rows at a horizon
+    centre, scale  of the trajectories it is applied to, where they are not in environment units: those are centre + scale * x
     """
 
     name: str
     fn: Callable[[Traj], Rows]
     count: Callable[[int], int]
     margin: float = 0.0
+    centre: Tensor | None = None
+    scale: Tensor | None = None
 
+    trailing: ClassVar = {"centre": 1, "scale": 1}
     spans = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{i}" for i in range(self.count(horizon))]
 
     def __call__(self, x: Traj) -> Rows:
+        if self.centre is not None and self.scale is not None:
+            x = self.centre.to(x) + self.scale.to(x) * x
         return self.fn(x) + self.margin
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
@@ -246,8 +263,12 @@ class Opaque:
         return rows.detach(), pull, size[:, None].expand_as(rows)
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Opaque":
-        fn = self.fn
-        return replace(self, fn=lambda z: fn(centre.to(z) + scale.to(z) * z))
+        if self.centre is None or self.scale is None:
+            return replace(self, centre=centre, scale=scale)
+        return replace(self, centre=self.centre + self.scale * centre, scale=self.scale * scale)
+
+    def take(self, which: Tensor) -> "Opaque":
+        return take(self, which)
 
     def to(self, like: Tensor) -> "Opaque":
         return self
@@ -299,6 +320,14 @@ class Constraint:
         """The constraint g <= -margin (margin in the units of g)."""
         return Constraint(tuple(part.shift(margin) for part in self.parts))
 
+    def take(self, which: Tensor) -> "Constraint":
+        """The same constraint of some plans of the batch alone."""
+        return Constraint(tuple(part.take(which) for part in self.parts))
+
+    def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> "Constraint":
+        """The constraint with observed quantities filled in; none observes anything yet."""
+        return self
+
     def to(self, like: Tensor) -> "Constraint":
         """The same constraint with its numbers in the dtype and on the device of `like`."""
         return Constraint(tuple(part.to(like) for part in self.parts))
@@ -310,5 +339,8 @@ def stack(constraints: Sequence[Constraint]) -> Constraint:
 
 
 def pull_back(g: Constraint, centre: Tensor, scale: Tensor) -> Constraint:
-    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units."""
+    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units.
+
+    centre, scale   [dim], or by plan and waypoint: [horizon | 1, dim] or [batch | 1, horizon | 1, dim]
+    """
     return Constraint(tuple(part.pull_back(centre, scale) for part in g.parts))

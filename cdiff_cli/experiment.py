@@ -5,7 +5,7 @@ import json
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli import figures, metrics
-from cdiff_cli.certificate import Saved, certificate
+from cdiff_cli.certificate import Saved, certificate, summary
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.planning import Plans, Rollout, follow, plan
@@ -29,12 +29,13 @@ Tick = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is on disk, and what the command prints of it."""
+    """A run that is on disk, and what the command prints of it: its rows, its picture, its verdict in a line and in numbers."""
 
     path: Path
     rows: list[Row]
     picture: Path
     counts: dict[str, int | None]
+    verdict: str
     notes: tuple[str, ...] = ()
 
 
@@ -49,7 +50,7 @@ def plan_run(resolved: Resolved, root: Path, tick: Tick) -> Finished:
         _plan_pictures(run.path, resolved, plans, free)
         if plans.chain is not None and resolved.problem.horizon == 1:
             notes.append(_chain_figure(run.path, resolved, plans))
-    return Finished(run.path, rows, run.path / "plan.png", counts, tuple(notes))
+    return Finished(run.path, rows, run.path / "plan.png", counts, f"certificate  {summary(counts)}", tuple(notes))
 
 
 def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None, hold: int = 100) -> Finished:
@@ -73,7 +74,7 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
             tick("video", 1, 1)
-    return Finished(run.path, rows, run.path / "rollout.png", counts)
+    return Finished(run.path, rows, run.path / "rollout.png", counts, f"certificate  {summary(counts)}")
 
 
 def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
@@ -86,19 +87,21 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         kernel=resolved.kernel,
         on_step=lambda call: tick("diffuser", call, calls),
     )
-    if isinstance(resolved.method, Unconstrained):
+    if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
         return free, free
-    total = calls + resolved.preset.extra_steps
+    total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
+    problem = resolved.problem if resolved.guided is None else replace(resolved.problem, denoiser=resolved.guided)
     plans = plan(
-        resolved.problem,
+        problem,
         resolved.method,
         resolved.seeds,
         kernel=resolved.kernel,
-        extra_steps=resolved.preset.extra_steps,
+        extra_steps=resolved.extra_steps,
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )
-    return plans, free
+    twice = resolved.guided is not None and resolved.settings["weight"] != 1.0  # with and without the condition
+    return replace(plans, calls=2 * plans.calls) if twice else plans, free
 
 
 def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:

@@ -5,6 +5,8 @@ sample after it. `on` says where g is evaluated and where the change is made:
 
 noisy   at x_t, the change made to x_{t-1}: the paper's
 clean   at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
+
+What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
 
 from collections.abc import Mapping
@@ -14,21 +16,19 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 import torch
 from torch.nn import functional as F
 
+from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import Warm, dynamics_of, split
+from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
+from cdiff_cli.safediffuser import SafeDiffuser
 
 On = Literal["noisy", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
 Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
-DYNAMICS_FROM = 0.995
-"""Of 0, 0.9, 0.95 and 0.995 the one with the smallest distance, all as safe when executed: alm on maze2d-umaze-disc and -slalom,
-100 random pairs, seed 2000.
-"""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Projected:
         return None
 
     def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
-        g = due(g, step, self.dynamics_from)
+        g = due(g, step.level, self.dynamics_from)
         if self.on == "clean":
             x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
             if self.correction == "kernel":
@@ -105,7 +105,7 @@ class PrimalDual:
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
-        g, dynamics = split(due(g, step, self.dynamics_from))
+        g, dynamics = split(due(g, step.level, self.dynamics_from))
         rows, pull, size = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
@@ -162,7 +162,7 @@ class AugmentedLagrangian:
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
-        g = due(g, step, self.dynamics_from)
+        g = due(g, step.level, self.dynamics_from)
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
             return step.reverse(x0), AlmState(lam, rho, warm)
@@ -177,6 +177,12 @@ class AugmentedLagrangian:
 
 METHODS: dict[str, type[Method]] = {
     "diffuser": Unconstrained,
+    "guidance": Guidance,
+    "conditional": Conditional,
+    "best-of-k": BestOf,
+    "final-projection": FinalProjection,
+    "terminal": Terminal,
+    "safediffuser": SafeDiffuser,
     "projected": Projected,
     "primal-dual": PrimalDual,
     "alm": AugmentedLagrangian,
@@ -224,11 +230,6 @@ def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, R
     gate = torch.sigmoid(rows)
     slope = gate * (1 + rows * (1 - gate))
     return F.silu(rows), lambda w: pull(w * slope), size
-
-
-def due(g: Constraint, step: Step, dynamics_from: float) -> Constraint:
-    """g, without its dynamics while the sample is still too noisy for them."""
-    return g if step.level >= dynamics_from else split(g)[0]
 
 
 def zeros(x: Traj, g: Constraint, expectation: Expectation) -> Rows:

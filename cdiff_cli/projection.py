@@ -24,7 +24,7 @@ from cdiff_cli.closed_forms import nearest, nearest_on_chain
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.levels import Affine, Ellipsoid, Quadric
+from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
 from cdiff_cli.segments import nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
@@ -88,7 +88,7 @@ def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
     for part in parts:
         level = getattr(part, "level", None)
         if isinstance(level, Affine):
-            found |= (level.a != 0).cpu()
+            found |= (level.a != 0).view(-1, dim).any(0).cpu()
         elif isinstance(level, Ellipsoid):
             found |= (level.which != 0).any(0).cpu()
         else:
@@ -100,7 +100,7 @@ def _restricted(part: Part, used: Sequence[int]) -> Part:
     """The same part of those coordinates alone."""
     level = getattr(part, "level", None)
     if isinstance(level, Affine):
-        return cast(Part, replace(cast(Any, part), level=replace(level, a=level.a[used])))
+        return cast(Part, replace(cast(Any, part), level=replace(level, a=level.a[..., used])))
     if isinstance(level, Ellipsoid):
         return cast(Part, replace(cast(Any, part), level=replace(level, which=level.which[:, used])))
     return part
@@ -147,7 +147,7 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
     if not bool(touched.any()):
         return z
     some, held = z[touched], Pins(pins.mask, pins.values[touched])
-    x = some
+    parts, x = [part.take(touched) for part in parts], some
     for _ in range(REFINEMENTS):
         x = nearest_in_planes(some, planes(parts, x, held), held)
     out = z.clone()
@@ -157,7 +157,7 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
 
 def has_exact_form(part: Part) -> bool:
     if isinstance(part, Waypoints):
-        return isinstance(part.level, Affine | Quadric | Ellipsoid)
+        return isinstance(part.level, Affine | Quadric | Framed | Ellipsoid)
     return isinstance(part, Chain) and (
         isinstance(part.level, Affine) or (isinstance(part.level, Ellipsoid) and part.level.side > 0 and part.level.is_ball)
     )
@@ -205,7 +205,7 @@ def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: floa
         matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
         x = begin[b : b + 1].double()
         one = Pins(pins.mask, x)
-        g64 = g.to(x)
+        g64 = g.take(torch.tensor([b], device=z.device)).to(x)
         for _ in range(rounds):
             rows, pull, _ = g64.linearise(x)
             jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]

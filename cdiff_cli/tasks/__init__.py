@@ -64,6 +64,34 @@ class Task(Protocol):
         ...
 
 
+class ControlTask(Task, Protocol):
+    """A task that is replanned at every environment step: what control.py asks of it besides."""
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        ...
+
+    @property
+    def invariant(self) -> tuple[str, ...]:
+        """Coordinates that nothing depends on; networks are not shown them."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """Environment steps of an episode."""
+        ...
+
+    @property
+    def observable(self) -> tuple[str, ...]:
+        """Names of the observed quantities that constraints may use."""
+        ...
+
+    def observed(self, env: Any) -> dict[str, float]:
+        """Their present values."""
+        ...
+
+
 def load_task(name: str) -> Any:
     """The task of that name; a CdiffError with a suggestion where there is none."""
     if name not in TASKS:
