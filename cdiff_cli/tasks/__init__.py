@@ -12,6 +12,8 @@ from cdiff_cli.errors import CdiffError, suggestion
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
     "maze2d-large": "cdiff_cli.tasks.maze2d:LARGE",
+    "hopper": "cdiff_cli.tasks.locomotion:HOPPER",
+    "swimmer": "cdiff_cli.tasks.locomotion:SWIMMER",
     "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
 }
 
