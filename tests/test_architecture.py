@@ -18,6 +18,7 @@ RANKS = {
     "inference": 0,
     "config": 1,
     "levels": 1,
+    "approach": 2,
     "constraint": 2,
     "networks": 3,
     "segments": 3,
