@@ -3,8 +3,7 @@
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import typer
 from rich.console import Console
 
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.progress import err, progress, training_progress
 from cdiff_cli.runs import METHOD_ORDER
 
 app = typer.Typer(
@@ -21,7 +21,6 @@ app = typer.Typer(
     help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
     epilog="Start with: cdiff plan --method alm",
 )
-err = Console(stderr=True)
 out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width of its own
 
 RUNS = Path("runs")
@@ -80,23 +79,6 @@ def reported(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr: call it with (what, done, of how many)."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    tasks: dict[str, Any] = {}
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-
-        def tick(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
-
-        yield tick
-
-
 @app.command()
 @reported
 def train(
@@ -114,8 +96,6 @@ def train(
     runs: RunsFolder = RUNS,
 ) -> None:
     """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors (or conditional-FILE) and its card."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
     from cdiff_cli import training
     from cdiff_cli.checkpoint import install
     from cdiff_cli.recipe import load_recipe, shown
@@ -133,24 +113,7 @@ def train(
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe
     work = runs / f"train-{task}-{name}-{seed}"
-    shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
-    columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
-        data, fit = None, None
-
-        def on_data(done: int, total: int) -> None:
-            nonlocal data
-            data = bar.add_task("demonstrations", total=total, loss="", rate="") if data is None else data
-            bar.update(data, completed=done)
-
-        def on_step(status: training.Status) -> None:
-            nonlocal fit
-            if fit is None:
-                fit = bar.add_task("training", total=status.steps, completed=status.step - 1, loss="", rate="")
-            speed = bar.tasks[-1].speed
-            rate = f"{speed:.1f} steps/s" if speed else ""
-            bar.update(fit, completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
-
+    with training_progress() as (on_data, on_step):
         try:
             checkpoint = training.train(
                 problem,
@@ -364,6 +327,36 @@ def compare(
     from cdiff_cli.comparison import print_comparison
 
     print_comparison(folder, out, style=style, paper=paper, intervals=intervals, against=against, test=test, task=task)
+
+
+@app.command()
+@reported
+def sweep(
+    task: Annotated[str, typer.Option(help="tasks, separated by commas")] = "maze2d-umaze",
+    methods: Annotated[str, typer.Option(help="methods, separated by commas")] = "diffuser,projected,primal-dual,alm",
+    presets: Annotated[str, typer.Option(help="presets, separated by commas")] = "recommended",
+    constraints: Annotated[list[Path] | None, typer.Option(help="YAML file of constraints; may be repeated [default: own]")] = None,
+    seeds: Annotated[int, typer.Option(help="number of seeds, a run each")] = 10,
+    seed: Seed = 0,
+    random: Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each seed")] = False,
+    rollout: Annotated[bool, typer.Option("--rollout", help="follow the plans in the simulator too")] = False,
+    jobs: Annotated[int, typer.Option(help="runs at a time, each on one thread")] = 1,
+    backend: Annotated[str, typer.Option(help="local, or a cluster: ray or dask (optional extras)")] = "local",
+    address: Annotated[str | None, typer.Option(help="of the cluster's head, as 127.0.0.1:6379")] = None,
+    runs: RunsFolder = RUNS,
+) -> None:
+    """Make the missing runs of a matrix (task, constraints, preset, method, seed); start it again and it goes on. Exit code 1 where
+    a run failed. `cdiff compare` then prints the table.
+    """
+    from cdiff_cli.sweep import Matrix, run_sweep
+
+    tasks, named, asked = ([name.strip() for name in text.split(",") if name.strip()] for text in (task, methods, presets))
+    matrix = Matrix(tasks, named, asked, constraints or [None], range(seed, seed + seeds), rollout, random)
+    failed = run_sweep(matrix, runs, jobs, err, backend, address)
+    for outcome in failed:
+        typer.echo(f"failed: {outcome.job.name}: {outcome.error}", err=True)
+    typer.echo(f"compare them with: cdiff compare {runs}")
+    raise typer.Exit(1 if failed else 0)
 
 
 @app.command()

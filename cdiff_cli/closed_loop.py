@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from cdiff_cli import control_figures, metrics
+from cdiff_cli.baselines import BestOf
 from cdiff_cli.control import Controller, Episodes, control
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
@@ -23,11 +24,13 @@ from cdiff_cli.tasks import ControlTask
 from cdiff_cli.training import device_name, git_commit
 
 
-def control_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None) -> Finished:
-    """Act for an episode a seed, replanning as the preset says; measure; write runs/<stamp>-rollout-.../"""
+def control_run(
+    resolved: Resolved, root: Path, tick: Tick, video: str | None = None, *, name: str | None = None, pictures: bool = True
+) -> Finished:
+    """Act for an episode a seed, replanning as the preset says; measure; write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
     acting, options = controller(resolved), resolved.options
     env_options = parse_env(acting.task, options.env)
-    with new_run(root, f"rollout-{options.task}-{options.method}-{options.preset}") as run:
+    with new_run(root, name or f"rollout-{options.task}-{options.method}-{options.preset}") as run:
         recorder = control_figures.Recorder(run.path / f"rollout.{video}", acting) if video else None
         env = env_options | ({"render": True} if video else {})
         done = control(acting, resolved.seeds, env, on_step=lambda k, n: tick("control", k, n), on_frame=recorder)
@@ -35,7 +38,8 @@ def control_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
         rows = _rows(resolved, acting, done, levels)
         _write(run.path, resolved, acting, done, rows)
         title = f"{options.task}, {options.method} ({options.preset}), n = {len(rows)}"
-        control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
+        if pictures:
+            control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
         if recorder:
             recorder.write(levels[0])
     notes = (
@@ -76,6 +80,8 @@ def controller(resolved: Resolved) -> Controller:
     problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
     if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
         raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
+    if isinstance(resolved.method, BestOf):
+        raise CdiffError(f"{options.method}: only for whole plans, and {problem.task.name} plans anew at each step; choose another")
     execute = preset.execute if options.execute is None else options.execute
     inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
     ahead = 1 if inverse is None else inverse.ahead
@@ -90,7 +96,7 @@ def controller(resolved: Resolved) -> Controller:
         raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
     return Controller(
         task=cast(ControlTask, problem.task),
-        denoiser=problem.denoiser,
+        denoiser=resolved.guided or problem.denoiser,
         schedule=problem.schedule,
         frame=checkpoint.frame,
         inverse=checkpoint.inverse,
@@ -130,7 +136,7 @@ def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -
     measured = metrics.control_metrics(done, levels, (space.low.astype(float), space.high.astype(float)))
     env = {"env": " ".join(resolved.options.env)} if resolved.options.env else {}
     return [
-        resolved.row() | env | {"seed": seed} | values | {"calls": acting.calls}
+        resolved.row() | env | {"seed": seed} | values | {"calls": acting.calls * resolved.calls_a_step}
         for seed, values in zip(resolved.seeds, measured, strict=True)
     ]
 

@@ -39,22 +39,32 @@ class Finished:
     notes: tuple[str, ...] = ()
 
 
-def plan_run(resolved: Resolved, root: Path, tick: Tick) -> Finished:
-    """Plan, measure, write runs/<stamp>-plan-.../"""
+def plan_run(resolved: Resolved, root: Path, tick: Tick, *, name: str | None = None, pictures: bool = True) -> Finished:
+    """Plan, measure, write runs/<stamp>-plan-.../, or <stamp>-<name>"""
     plans, free = _plan_both(resolved, tick)
     rows = _plan_rows(resolved, plans, free)
     notes = []
-    with new_run(root, _name("plan", resolved)) as run:
+    with new_run(root, name or _name("plan", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
         counts = _write_certificate(run.path, resolved, plans.x)
-        _plan_pictures(run.path, resolved, plans, free)
-        if plans.chain is not None and resolved.problem.horizon == 1:
+        if pictures:
+            _plan_pictures(run.path, resolved, plans, free)
+        if pictures and plans.chain is not None and resolved.problem.horizon == 1:
             notes.append(_chain_figure(run.path, resolved, plans))
     return Finished(run.path, rows, run.path / "plan.png", counts, f"certificate  {summary(counts)}", tuple(notes))
 
 
-def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None, hold: int = 100) -> Finished:
-    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../"""
+def rollout_run(
+    resolved: Resolved,
+    root: Path,
+    tick: Tick,
+    video: str | None = None,
+    hold: int = 100,
+    *,
+    name: str | None = None,
+    pictures: bool = True,
+) -> Finished:
+    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
     task = resolved.problem.task
     if not hasattr(task, "track"):
         raise CdiffError(f"{task.name} has no environment to roll out in; plan it with `cdiff plan --task {task.name}`")
@@ -63,13 +73,14 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
     done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n), plans.u)
     measured = metrics.rollout_metrics(resolved.problem.g, done.x, done.reward, done.success, done.goal_distance)
     rows = [row | more for row, more in zip(_plan_rows(resolved, plans, free), measured, strict=True)]
-    with new_run(root, _name("rollout", resolved)) as run:
+    with new_run(root, name or _name("rollout", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
         _write_rollout(run.path, resolved, done)
         counts = _write_certificate(run.path, resolved, plans.x, done.x)
-        _plan_pictures(run.path, resolved, plans, free)
-        title = f"{task.name}, {resolved.options.method}: executed over planned"
-        figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
+        if pictures:
+            _plan_pictures(run.path, resolved, plans, free)
+            title = f"{task.name}, {resolved.options.method}: executed over planned"
+            figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
         if video:
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
@@ -100,8 +111,7 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )
-    twice = resolved.guided is not None and resolved.settings["weight"] != 1.0  # with and without the condition
-    return replace(plans, calls=2 * plans.calls) if twice else plans, free
+    return replace(plans, calls=resolved.calls_a_step * plans.calls), free
 
 
 def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:

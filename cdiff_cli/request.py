@@ -83,6 +83,11 @@ class Resolved:
         return self.preset.extra_steps_for(self.options.method) if asked is None else asked
 
     @property
+    def calls_a_step(self) -> int:
+        """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
+        return 2 if self.guided is not None and self.settings["weight"] != 1.0 else 1
+
+    @property
     def seeds(self) -> list[int]:
         return list(range(self.options.seed, self.options.seed + self.options.n))
 
@@ -204,7 +209,7 @@ def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: 
         raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
     if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
         raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
-    return guided(found.net, method.weight)
+    return guided(found.net, method.weight, 1.0 if found.frame is None else RELATIVE_LIMIT)
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:
