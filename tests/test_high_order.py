@@ -10,6 +10,7 @@ from cdiff_cli.chains import SHORT, nearest_chain, pool_violators
 from cdiff_cli.constraint import Chain, Constraint, Pins, Segments, Waypoints, pull_back
 from cdiff_cli.levels import Affine
 from cdiff_cli.projection import has_exact_form, project
+from cdiff_cli.safediffuser import jacobian
 from cdiff_cli.spec import Dcbf
 from tests.problems import F64, ball, dense_jacobian, ellipsoid, half_space, normal, num, pin, qp_project, vec
 
@@ -146,6 +147,12 @@ def test_long_high_order_chains_are_found_too(alpha):
     assert float(g(x).max()) <= 1e-6  # what project promises
     again = project(g, x, pin(x, 0))
     torch.testing.assert_close(again, x, atol=1e-6, rtol=0)
+
+
+def test_its_jacobian_is_that_of_autograd():
+    g, x = high(ball(1), 0.3, 0.5), normal(0, 1, 7, 2)
+    J = jacobian(g.parts[0], x)[0].flatten(1)
+    torch.testing.assert_close(J, torch.from_numpy(dense_jacobian(g, x)[0]), atol=1e-12, rtol=0)
 
 
 # look-ahead -----------------------------------------------------------------------------------------------------------
