@@ -2,7 +2,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 SLALOM := --constraints constraints/maze2d-umaze-slalom.yaml
 
-.PHONY: demo test lint tables benchmark oracle clean
+.PHONY: demo test lint tables benchmark oracle experts clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
 	$(BIN)/cdiff plan --method diffuser $(SLALOM) --runs runs/demo --json >/dev/null
@@ -27,6 +27,10 @@ benchmark: .venv/.ready  ## timings, as ratios within one run
 
 oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
 	$(BIN)/python tests/benchmarks/oracle.py
+
+experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; tens of minutes
+	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1 2
+	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 1 2
 
 .venv/.ready: requirements.txt pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv

@@ -41,7 +41,7 @@ def control_run(
         if pictures:
             control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
         if recorder:
-            recorder.write(levels[0])
+            recorder.write(done, levels)
     notes = (
         [f"warning: {int(done.diverged.sum())} of {len(rows)} episodes diverged and were stopped"] if done.diverged.any() else []
     )

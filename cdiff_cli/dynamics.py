@@ -134,6 +134,8 @@ class Reachable:
     def shift(self, margin: float) -> "Reachable":
         return replace(self, tolerance=self.tolerance - margin)
 
+    shift_level = shift
+
     def segment_max(self, x: Traj) -> Rows:
         """A step's own row."""
         return self(x)

@@ -90,6 +90,10 @@ class Affine:
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Affine":
         return Affine(self.a * scale, self.b - dot(centre, self.a))
 
+    def through(self, led: Tensor) -> "Affine":
+        """f(led x)   led [dim, dim]"""
+        return replace(self, a=self.a @ led)
+
     def shift(self, margin: float) -> "Affine":
         return replace(self, b=self.b - margin)
 
@@ -228,9 +232,10 @@ class Ellipsoid:
     A ball has all axes equal to its radius m, and f is the signed distance in metres. For unequal semi-axes m is the
     smallest one: |f| never exceeds the distance outside, nor the depth inside.
 
-    which   selects the coordinates it acts on      [k, dim], rows of the identity
+    which   selects what it acts on                 [k, dim], unit rows that share no coordinate
     centre, axes                                    [k]
     m       value scale, environment units          scalar
+    mixed   whether a row of `which` holds more than one coordinate
     """
 
     which: Tensor
@@ -238,18 +243,19 @@ class Ellipsoid:
     axes: Tensor
     m: Tensor
     side: int
+    mixed: bool = False
 
-    trailing: ClassVar = {"centre": 1, "axes": 1, "m": 0}
+    trailing: ClassVar = {"which": 2, "centre": 1, "axes": 1, "m": 0}
 
     def __call__(self, x: Tensor) -> Tensor:
         return self.side * self.m * (1 - self.scaled(x).norm(dim=-1))
 
     def scaled(self, x: Tensor) -> Tensor:
         """Coordinates in which the surface is the unit sphere [..., k], and a segment straight."""
-        return (x @ self.which.T - self.centre) / self.axes
+        return (times(x, self.which.mT) - self.centre) / self.axes
 
     def gradient(self, x: Tensor) -> Tensor:
-        return (self._slope(self.scaled(x), self.m) / self.axes) @ self.which
+        return times(self._slope(self.scaled(x), self.m) / self.axes, self.which)
 
     def _slope(self, y: Tensor, m: Tensor) -> Tensor:
         """df/dy [..., k]."""
@@ -259,8 +265,18 @@ class Ellipsoid:
         return self.gradient(x).square().sum(-1)
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Ellipsoid":
+        if self.mixed:
+            which = self.which * scale[..., None, :]
+            s, inner = which.norm(dim=-1), times(centre, self.which.mT)
+            return replace(self, which=which / s[..., None], centre=(self.centre - inner) / s, axes=self.axes / s)
         s = scale @ self.which.T
         return replace(self, centre=(self.centre - centre @ self.which.T) / s, axes=self.axes / s)
+
+    def through(self, led: Tensor) -> "Ellipsoid":
+        """f(led x)   led [dim, dim], which leaves the rows of `which` without a coordinate in common"""
+        which = self.which @ led
+        s = which.norm(dim=-1)
+        return replace(self, which=which / s[:, None], centre=self.centre / s, axes=self.axes / s, mixed=True)
 
     def shift(self, margin: float) -> "Ellipsoid":
         grown = 1 + self.side * margin / self.m
@@ -282,12 +298,12 @@ class Ellipsoid:
 
     def between(self, x: Tensor, s: Tensor) -> Between:
         y, m = self.scaled(x), each_end(self.m, 0)[0]
-        share, (first, last) = s[..., None], each_end(self.axes, 1)
+        share, (first, last), (to, there) = s[..., None], each_end(self.axes, 1), each_end(self.which, 2)
         at = torch.lerp(y[..., :-1, :], y[..., 1:, :], share)
         slope = self._slope(at, m)
         back, on = (1 - share) * slope / first, share * slope / last
         value = self.side * m * (1 - at.norm(dim=-1))
-        return Between(value, back @ self.which, on @ self.which, back.square().sum(-1) + on.square().sum(-1))
+        return Between(value, times(back, to), times(on, there), back.square().sum(-1) + on.square().sum(-1))
 
     @cached_property
     def is_ball(self) -> bool:
@@ -295,7 +311,7 @@ class Ellipsoid:
 
     def quadric(self) -> Quadric:
         """The same set as a Quadric: side * (1 - |(x - centre) / axes|^2) <= 0."""
-        weight = self.which.T / self.axes[..., None, :] ** 2
+        weight = self.which.mT / self.axes[..., None, :] ** 2
         q = -2 * times(self.centre, weight.mT)
         r = self.side * ((self.centre / self.axes).square().sum(-1) - 1)
         return Quadric(-self.side * weight @ self.which, -self.side * q, r)

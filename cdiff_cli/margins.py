@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cdiff_cli.config import Dumper, Strict, load
-from cdiff_cli.constraint import Chain, Constraint, Part
+from cdiff_cli.constraint import Constraint, Part
 from cdiff_cli.errors import CdiffError
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
 
     def tight(part: Part) -> Part:
         margin = margins.get(part.name, 0.0)
-        return part.shift(margin * (part.alpha if isinstance(part, Chain) else 1.0)) if margin else part
+        return part.shift_level(margin) if margin else part
 
     return Constraint(tuple(tight(part) for part in g.parts))
 

@@ -16,6 +16,7 @@ from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step
 from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
+from cdiff_cli.observed import require_bound
 from cdiff_cli.projection import ADMM_ROUNDS, project, project_from
 from cdiff_cli.tasks import Task
 
@@ -111,6 +112,7 @@ def plan(
     on_step: Callable[[int], None] | None = None,
 ) -> Plans:
     """One plan a seed. Equal seeds meet equal noise whatever the method, so differences between methods are paired."""
+    require_bound(problem.g)
     if isinstance(method, BestOf):
         return _best_of(problem, method.k, seeds, kernel, extra_steps, on_step)
     device, dim = problem.device, len(problem.task.layout)

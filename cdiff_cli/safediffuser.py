@@ -102,7 +102,8 @@ def jacobian(part: Part, x: Traj) -> Tensor:
     """dg/dx [batch, n, horizon, dim]: rows that share no waypoint are pulled back together."""
     values, pull, _ = part.linearise(x)
     n, horizon = values.shape[1], x.shape[1]
-    reach = 1 if isinstance(part, Waypoints) else 2 if isinstance(part, Chain | Segments) else None
+    reaches = {Waypoints: 1, Segments: 2, Chain: len(part.coefficients) if isinstance(part, Chain) else 0}
+    reach = reaches.get(type(part))
     out = x.new_zeros(len(x), n, horizon, x.shape[2])
     if reach is None:
         for row in range(n):

@@ -207,7 +207,7 @@ class Data:
         kept = {"normaliser.centre": self.normaliser.centre, "normaliser.scale": self.normaliser.scale}
         if self.frame is None:
             return kept | {"demonstrations": self.normaliser.decode(sample).float()}
-        kept |= {f"frame.{name}": getattr(self.frame, name).contiguous() for name in ("seen", "mean", "scale")}
+        kept |= {f"frame.{name}": getattr(self.frame, name).contiguous() for name in ("seen", "mean", "gain", "scale")}
         return kept | {"demonstrations": sample.float()}
 
 

@@ -8,10 +8,11 @@ import qpsolvers
 import torch
 from scipy.optimize import nnls
 
-from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Pins, Waypoints
 from cdiff_cli.diffusion import Step
 from cdiff_cli.errors import SpecError
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
+from cdiff_cli.opaque import Opaque
 from cdiff_cli.projection import project
 from cdiff_cli.spec import load_constraints
 

@@ -174,8 +174,11 @@ def test_a_ball_that_is_run_into_is_pushed_along():
     env.reset(seed=0, options={"obstacle": (-1.5, 0.0, 3.0, 0.0)})
     for _ in range(60):
         obs, _, _, _, info = env.step(np.zeros(2, dtype=np.float32))
-    assert info["contacts"] > 0
-    assert BALL_RUN.observe(obs)[0] > 2.0
+    x, o = BALL_RUN.observe(obs), BALL_RUN.observe(obs[7:])
+    assert info["contacts"] > 20
+    np.testing.assert_allclose(o, [-1.5 + 60 * DT * 3.0, 0.0, 3.0, 0.0], atol=1e-9)  # it yields to nothing
+    assert x[2] == pytest.approx(3.0, abs=0.05)  # m/s: pushed along, no longer bouncing
+    assert np.hypot(*(x - o)[:2]) == pytest.approx(2 * RADIUS, abs=0.01)
 
 
 def test_the_picture_shows_both_balls():

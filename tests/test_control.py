@@ -77,7 +77,13 @@ def frame() -> Frame:
     """Windows that speed up by 0.1 a step: their mean is the plan."""
     k = torch.arange(H, dtype=F64)
     mean = torch.stack((torch.zeros(H, dtype=F64), 0.1 * k), 1)
-    return Frame(Normaliser(vec(0.0, 0.0), vec(1.0, 1.0)), torch.tensor([False, True]), mean, torch.full((H, 2), 0.1, dtype=F64))
+    return Frame(
+        Normaliser(vec(0.0, 0.0), vec(1.0, 1.0)),
+        torch.tensor([False, True]),
+        mean,
+        torch.zeros(H, 2, 2, dtype=F64),
+        torch.full((H, 2), 0.1, dtype=F64),
+    )
 
 
 def mean_window(x: torch.Tensor, t: int) -> torch.Tensor:

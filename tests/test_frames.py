@@ -46,6 +46,17 @@ def test_every_waypoint_has_its_own_scale_of_one():
     torch.testing.assert_close(z.std(0)[:, :2].amax(1), torch.ones(7, dtype=F64))  # x and y share theirs: the wider has one
 
 
+def test_what_follows_from_the_present_state_alone_is_in_the_frame():
+    """Windows of a linear system without inputs: nothing is left to guess."""
+    start = normal(3, 40, 3)
+    x = [start]
+    for _ in range(7):
+        x.append(x[-1] @ torch.from_numpy(A).T)
+    every = torch.stack(x, 1)
+    some = Frame.fit(Windows.of(list(every[:30].numpy()), 8), LAYOUT, (), ())
+    torch.testing.assert_close(some.at(every[30:, 0]).centre[:, 1:], every[30:, 1:])
+
+
 def test_a_window_moved_along_an_invariant_coordinate_looks_the_same():
     x = windows()
     torch.testing.assert_close(FRAME.encode(x + torch.tensor([7.0, 0.0, 0.0])), FRAME.encode(x))

@@ -7,11 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Constraint, Opaque, Pins, Waypoints
+from cdiff_cli.constraint import Constraint, Pins, Waypoints
 from cdiff_cli.diffusion import Schedule, Step, sample
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import Unconstrained, make_method
+from cdiff_cli.opaque import Opaque
 from cdiff_cli.safediffuser import SafeDiffuser, jacobian, nonnegative_least, relaxation
 from tests.problems import (
     F64,

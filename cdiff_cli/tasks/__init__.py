@@ -13,6 +13,8 @@ TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
     "maze2d-large": "cdiff_cli.tasks.maze2d:LARGE",
     "ball-run": "cdiff_cli.tasks.ball_run:BALL_RUN",
+    "hopper": "cdiff_cli.tasks.locomotion:HOPPER",
+    "swimmer": "cdiff_cli.tasks.locomotion:SWIMMER",
     "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
 }
 

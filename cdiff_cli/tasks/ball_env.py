@@ -43,6 +43,7 @@ DT = 4 / 120  # s, an environment step: four substeps
 FORCE = 3.5  # N a unit of action
 RADIUS = 0.5  # m, agent and obstacle alike
 MASS = 0.3  # kg
+HEAVY = 3e4  # kg, of the obstacle: pushed by the ball it changes its velocity by 1e-5 of what the ball does
 GOAL_X = 1000.0  # m, the far point the reward measures the distance to
 MAX_STEPS = 100
 LANE, SPEED_LIMIT = 2.0, 2.5  # m and m/s: SafetyBallRun's own cost
@@ -106,18 +107,19 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         before = self._distance()
         force = (FORCE * u[0], FORCE * u[1], 0.0)
         pb.applyExternalForce(self._ball, -1, force, self._position, pb.WORLD_FRAME, physicsClientId=self._client)
+        crossed = False
         if self._motion is not None:
-            (x, y), (vx, vy) = self._where, self._velocity
-            self._where = (x + DT * vx, y + DT * vy)
-            self._place(self._obstacle, self._where)
+            crossed = self.collide and self._in_the_way()
+            self._push_obstacle()
         pb.stepSimulation(physicsClientId=self._client)
-        was = self._position
         self._read()
         self._steps += 1
-        contact = self._touched(was)
+        contact = crossed or self._pressed()
         self.contacts += contact
         if self._motion is not None:
-            t = DT * self._steps
+            t, (x, y), (vx, vy) = DT * self._steps, self._where, self._velocity
+            self._where = (x + DT * vx, y + DT * vy)
+            self._place(self._obstacle, self._where)  # to where it was sent, whatever it met
             self._velocity = self._motion.velocity(t, self._where, self._velocity, self._position[:2])
         reward = 60.0 * (before - self._distance()) - 0.5 * float(np.hypot(*u))
         return self._observation(), reward, False, False, self._info(contact)
@@ -168,8 +170,10 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         pb.changeDynamics(self._ball, -1, lateralFriction=1.1, restitution=0.7, **rolling, **c)
         self._obstacle = -1
         if self.playing != "none":
-            solid = sphere if self.collide else -1
-            self._obstacle = pb.createMultiBody(0, solid, self._sphere((0.85, 0.25, 0.2, 1)), (0, 0, -100), **c)
+            mass, solid = (HEAVY, sphere) if self.collide else (0, -1)
+            self._obstacle = pb.createMultiBody(mass, solid, self._sphere((0.85, 0.25, 0.2, 1)), (0, 0, RADIUS), **c)
+            pb.changeDynamics(self._obstacle, -1, linearDamping=0, **c)
+            pb.setCollisionFilterPair(floor, self._obstacle, -1, -1, 0, **c)
         if self.render_mode:
             self._markings()
 
@@ -202,12 +206,25 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
     def _distance(self) -> float:
         return float(np.hypot(self._position[0] - GOAL_X, self._position[1]))
 
-    def _touched(self, was: tuple[float, float, float]) -> bool:
-        """Whether the balls met: Bullet keeps the contacts of the last substep only, so the overlap it was given counts too."""
+    def _push_obstacle(self) -> None:
+        """Its velocity for this step, its weight carried: Bullet moves it through the substeps, and it yields to nothing."""
+        c = {"physicsClientId": self._client}
+        if self.collide:
+            pb.resetBaseVelocity(self._obstacle, (*self._velocity, 0), (0, 0, 0), **c)
+            pb.applyExternalForce(self._obstacle, -1, (0, 0, 9.81 * HEAVY), (*self._where, RADIUS), pb.WORLD_FRAME, **c)
+
+    def _in_the_way(self) -> bool:
+        """Whether the balls overlap somewhere in this step if neither feels the other (but for the 6 mm an input moves)."""
+        d = np.subtract(self._where, self._position[:2])
+        w = DT * np.subtract(self._velocity, self._twist[0][:2])
+        nearest = d + w * np.clip(-(d @ w) / max(w @ w, 1e-12), 0.0, 1.0)
+        return bool(nearest @ nearest < (2 * RADIUS) ** 2)
+
+    def _pressed(self) -> bool:
+        """Whether they pushed each other in the last substep, the only one whose contacts Bullet keeps."""
         if self._motion is None or not self.collide:
             return False
-        gap = min(np.hypot(p[0] - self._where[0], p[1] - self._where[1]) for p in (was, self._position))
-        return bool(gap < 2 * RADIUS or pb.getContactPoints(self._ball, self._obstacle, physicsClientId=self._client))
+        return any(point[9] > 0 for point in pb.getContactPoints(self._ball, self._obstacle, physicsClientId=self._client))
 
     def _observation(self) -> Array:
         velocity, spin = self._twist
