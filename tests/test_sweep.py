@@ -10,7 +10,7 @@ import torch
 
 from cdiff_cli import sweep
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.runs import COSTS, merge_kinds
+from cdiff_cli.runs import COSTS, merge_kinds, newest
 from cdiff_cli.sweep import Matrix, Outcome, plan_sweep, progress_table, run_job
 from tests.test_cli import cdiff
 
@@ -23,9 +23,9 @@ def matrix(methods=("projected",), seeds=(0, 1), **more):
 
 
 def table(root):
-    """What `compare` would average, times apart."""
+    """What `compare` averages, times apart: the newest row of a seed, for a worker may end its run after its sweep was killed."""
     plans, _ = merge_kinds(root)
-    rows = sorted(plans, key=lambda row: (row["method"], row["preset"], row["seed"]))
+    rows = [row for by_seed in newest(plans).values() for _, row in sorted(by_seed.items())]
     return [{name: value for name, value in row.items() if name not in COSTS} for row in rows]
 
 
