@@ -6,7 +6,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cdiff_cli.levels import Between, times
+from cdiff_cli.levels import Between, Ellipsoid, times
 
 NEAREST = 1e-9  # of a distance to the centre, so that the centre itself has a normal
 
@@ -74,3 +74,13 @@ class Approach:
         f, slope = self(x), self.gradient(x)
         back, on = (1 - s)[..., None] * slope[..., :-1, :], s[..., None] * slope[..., 1:, :]
         return Between(torch.lerp(f[..., :-1], f[..., 1:], s), back, on, back.square().sum(-1) + on.square().sum(-1))
+
+
+def approached(ball: Ellipsoid, later: Tensor, led: Tensor, time: float) -> Approach:
+    """The barrier of a ball that states keep outside of.
+
+    later   where its centre will be `time` seconds on    [..., k]
+    led     the state `time` seconds on is led x          [dim, dim]
+    """
+    rates = ball.which @ (led - torch.eye(len(led)).to(led)) / time
+    return Approach(ball.which, ball.centre, rates, (later - ball.centre) / time, ball.m, time)

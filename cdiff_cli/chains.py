@@ -12,17 +12,21 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from cdiff_cli.approach import Approach
 from cdiff_cli.constraint import Chain, Pins, Rows, Traj
 from cdiff_cli.levels import Affine, Ellipsoid, times
 
 SHORT = 32  # indices up to which all blocks are written out at once
 FLIPS = 1000  # changes of the active set; a handful is usual
+LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
 NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
 
 
 def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
     """The nearest trajectory to z with g <= 0; waypoints are pinned as a whole or not at all."""
     level = chain.acting
+    if isinstance(level, Approach):
+        return _by_linearising(chain, level, z, pins)
     if isinstance(level, Affine):
         h, unit = -level(z), -level.a
         way = level.a.square().sum(-1).clamp_min(1e-30).rsqrt()
@@ -41,6 +45,23 @@ def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
     if isinstance(level, Ellipsoid):
         return z + times((step / length)[..., None] * y, level.which)
     return z + step[..., None] * unit
+
+
+def _by_linearising(chain: Chain, level: Approach, z: Traj, pins: Pins) -> Traj:
+    """A nearest trajectory to z, by the exact projection onto the chain of the barriers linearised where the last one ended: each
+    moves its waypoint along its gradient there. A local solution; what it ends on satisfies the chain to rounding.
+    """
+    x = z
+    for _ in range(LINEARISED):
+        h = -level(x)
+        if not bool((chain.rows_of(-h) > 0).any()) and x is not z:
+            break
+        slope = -level.gradient(x)
+        size = slope.square().sum(-1).clamp_min(1e-30)
+        there = h + (slope * (z - x)).sum(-1)
+        target = _nearest_values(chain, there, 1 / size, None, pins)
+        x = z + ((target - there) / size)[..., None] * slope
+    return x
 
 
 def _nearest_values(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins) -> Rows:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cdiff_cli.config import Dumper, Strict, load
-from cdiff_cli.constraint import Constraint, Part
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.errors import CdiffError
 
 Array = NDArray[np.float64]
@@ -59,11 +59,7 @@ def calibrated(checkpoint: Path, weights_sha256: str, stem: str) -> dict[str, fl
 def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
     """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
 
-    def tight(part: Part) -> Part:
-        margin = margins.get(part.name, 0.0)
-        return part.shift_level(margin) if margin else part
-
-    return Constraint(tuple(tight(part) for part in g.parts))
+    return Constraint(tuple(part.shift_level(margins.get(part.name, 0.0)) if part.name in margins else part for part in g.parts))
 
 
 def errors(foreseen: Array, executed: Array) -> Array:

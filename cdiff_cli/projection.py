@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cdiff_cli.approach import Approach
 from cdiff_cli.chains import nearest_on_chain
 from cdiff_cli.closed_forms import nearest
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
@@ -165,7 +166,7 @@ def has_exact_form(part: Part) -> bool:
     if not isinstance(part, Chain):
         return False
     level = part.acting
-    return isinstance(level, Affine) or (isinstance(level, Ellipsoid) and level.side > 0 and level.is_ball)
+    return isinstance(level, Affine | Approach) or (isinstance(level, Ellipsoid) and level.side > 0 and level.is_ball)
 
 
 def exact(part: Part, z: Traj, pins: Pins) -> Traj:

@@ -171,7 +171,8 @@ def resolve(options: Options) -> Resolved:
         denoiser, normaliser = network_denoiser(checkpoint.net, limit), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
-    kinds, g = load_constraints(path, task.name, task.layout, checkpoint.dynamics if checkpoint else None)
+    fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
+    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable)
     steps = preset.steps if options.steps is None else options.steps
     if steps is not None:
         if not 1 <= steps <= schedule.n_steps:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Protocol, Union, cast
 import torch
 from pydantic import Field, create_model, model_validator
 
+from cdiff_cli.approach import approached
 from cdiff_cli.config import Document, Strict
 from cdiff_cli.constraint import Chain, Constraint, Part
 from cdiff_cli.dynamics import LinearDynamics, Reachable
@@ -39,9 +40,10 @@ DYNAMICS_TOLERANCE = 1e-5  # of a step against the dynamics, environment units: 
 
 
 class LookAhead(Strict):
-    """The barrier is taken of the place that the velocity leads to within `time`, h(p + time v), in its place."""
+    """The barrier looks ahead by `time`: psi = h + time dh/dt, or h of the place that the velocity leads to, h(p + time v)."""
 
     time: Annotated[PositiveNumber, Field(description="seconds")]
+    form: Annotated[Literal["rate", "place"], Field(description="rate: h + time dh/dt; place: h(p + time v)")] = "rate"
     velocity: Annotated[dict[str, str], Field(min_length=1, description="the coordinate that is the rate of each coordinate")]
 
 
@@ -55,9 +57,11 @@ class Dcbf(Strict):
     order: 2      psi(x) = h(x') - (1 - alpha) h(x), psi(x') >= (1 - alpha2) psi(x): a high-order barrier (Xiong et al., 2022, IEEE
                   Transactions on Cybernetics). Keeps h >= 0 where the plan begins with h >= 0 and psi >= 0. Of a plan that begins
                   with psi < 0 it asks that psi recovers; h may fall below 0 meanwhile.
-    look_ahead    h of the place that the velocity leads to, h(p + time v): an input changes it at once. Keeps that >= 0. The place
-                  p itself is an average of the places it was led to (p' = p + dt v, dt <= time): it stays within a convex safe
-                  set, and round an obstacle it may cut the corner. An observed velocity leads the obstacle on likewise.
+    look_ahead    another barrier in the place of h, which an input changes at once; an observed velocity leads the obstacle on too:
+        form: rate    psi = h + time dh/dt. While psi >= 0, h(t) >= h(0) e^(-t / time): what starts safe stays safe (a high-order
+                      barrier; Xiao and Belta, 2019), in continuous time and for a plan executed exactly
+        form: place   h(p + time v), never below psi. Keeps that >= 0; p itself is an average of the places it was led to
+                      (p' = p + dt v, dt <= time): it stays within a convex safe set, and round an obstacle may cut the corner
     """
 
     kind: Literal["dcbf"]
@@ -83,6 +87,9 @@ class Dcbf(Strict):
         if self.look_ahead is not None:
             if isinstance(self.barrier, Quadratic) and (self.barrier.P is not None or self.barrier.form != "distance"):
                 raise ValueError("`look_ahead` takes a linear barrier or a quadratic one of `form: distance`")
+            round_ = isinstance(self.barrier, Quadratic) and (self.barrier.radius is None or self.barrier.side == "inside")
+            if round_ and self.look_ahead.form == "rate":
+                raise ValueError("`look_ahead` of `form: rate` takes a linear barrier or the outside of a ball; try `form: place`")
             rates, own = self.look_ahead.velocity, dict.fromkeys(name for _, name in self.barrier.coordinates())
             if set(rates) != set(own) or len(set(rates.values())) < len(rates) or set(rates.values()) & set(own):
                 raise ValueError(f"`look_ahead.velocity` must name a rate of its own for each of {', '.join(own)}")
@@ -109,14 +116,19 @@ class Dcbf(Strict):
         led = torch.eye(len(layout), dtype=torch.float64)
         for name, rate in self.look_ahead.velocity.items():
             led[layout.index(name), layout.index(rate)] = self.look_ahead.time
-        ahead = cast(Affine | Ellipsoid, at(self.look_ahead.time)).through(led)
-        return Chain(self.name, at(0.0), self.alpha, alpha2, ahead)
+        level, later = at(0.0), cast(Affine | Ellipsoid, at(self.look_ahead.time))
+        if isinstance(later, Affine) or self.look_ahead.form == "place":
+            return Chain(self.name, level, self.alpha, alpha2, later.through(led))
+        ahead = approached(cast(Ellipsoid, level), later.centre, led, self.look_ahead.time)
+        return Chain(self.name, level, self.alpha, alpha2, ahead)
 
     def describe(self) -> str:
         rule = f"h' >= {1 - self.alpha:g} h"
         if self.order == 2:
             rule = f"psi' >= {1 - (self.alpha2 or self.alpha):g} psi, psi = h' - {1 - self.alpha:g} h"
-        ahead = f" in {self.look_ahead.time:g} s at the present velocity" if self.look_ahead else ""
+        lead, ahead = self.look_ahead, ""
+        if lead is not None:
+            ahead = f", h + {lead.time:g} s dh/dt for h" if lead.form == "rate" else f" in {lead.time:g} s at the present velocity"
         return f"{rule}, h >= 0 where {self.barrier.describe()}{ahead}{moves(self.velocity, self.hold)}"
 
 

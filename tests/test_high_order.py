@@ -159,7 +159,7 @@ def test_its_jacobian_is_that_of_autograd():
 
 BALL = {"kind": "quadratic", "side": "outside", "centre": {"x": 0.5, "y": 0.0}, "radius": 1.0}
 WALL = {"kind": "linear", "a": {"x": 2.0}, "b": 1.0}
-LEAD = {"time": 0.2, "velocity": {"x": "vx", "y": "vy"}}
+LEAD = {"time": 0.2, "form": "place", "velocity": {"x": "vx", "y": "vy"}}
 
 
 def leading(barrier=BALL, lead=LEAD, **more):

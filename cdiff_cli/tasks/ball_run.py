@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdiff_cli.tasks.obstacle import PATTERNS
+
 Array = NDArray[np.float64]
 
 DT = 4 / 120
@@ -39,6 +41,7 @@ class BallRun:
     dt = DT
     actions = ("force_x", "force_y")
     invariant = ("x",)
+    env_options = {"pattern": PATTERNS, "collide": (True, False)}
     observable = ("obstacle.x", "obstacle.y", "obstacle.vx", "obstacle.vy")
 
     def make_env(self, render: bool = False, pattern: str | None = None, collide: bool = True) -> Any:
