@@ -340,7 +340,7 @@ def sweep(
     seed: Seed = 0,
     random: Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each seed")] = False,
     rollout: Annotated[bool, typer.Option("--rollout", help="follow the plans in the simulator too")] = False,
-    jobs: Annotated[int, typer.Option(help="runs at a time, each on one thread")] = 1,
+    jobs: Annotated[int, typer.Option(help="runs at a time, each on one thread of the CPU")] = 1,
     backend: Annotated[str, typer.Option(help="local, or a cluster: ray or dask (optional extras)")] = "local",
     address: Annotated[str | None, typer.Option(help="of the cluster's head, as 127.0.0.1:6379")] = None,
     runs: RunsFolder = RUNS,

@@ -101,7 +101,7 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
     if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
         return free, free
     total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
-    problem = resolved.problem if resolved.guided is None else replace(resolved.problem, denoiser=resolved.guided)
+    problem = replace(resolved.problem, denoiser=resolved.guided or resolved.problem.denoiser)
     plans = plan(
         problem,
         resolved.method,

@@ -74,7 +74,7 @@ class Resolved:
     constraints_path: Path
     checkpoint: Checkpoint | None
     margins: dict[str, float]
-    guided: Denoiser | None = None
+    conditional: Checkpoint | None = None
 
     @property
     def extra_steps(self) -> int:
@@ -83,9 +83,16 @@ class Resolved:
         return self.preset.extra_steps_for(self.options.method) if asked is None else asked
 
     @property
+    def guided(self) -> Denoiser | None:
+        """The clean estimate of a conditional planner; None of the other methods."""
+        planner = self.conditional
+        limit = 1.0 if planner is None or planner.frame is None else RELATIVE_LIMIT
+        return None if planner is None else guided(planner.net, self.settings["weight"], limit)
+
+    @property
     def calls_a_step(self) -> int:
         """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
-        return 2 if self.guided is not None and self.settings["weight"] != 1.0 else 1
+        return 2 if self.conditional is not None and self.settings["weight"] != 1.0 else 1
 
     @property
     def seeds(self) -> list[int]:
@@ -132,6 +139,7 @@ class Resolved:
                 "content": [spec.model_dump(mode="json", exclude_none=True) for spec in self.kinds],  # type: ignore[attr-defined]
             },
             "checkpoint": None if card is None else card.model_dump(mode="json"),
+            "conditional": None if self.conditional is None else self.conditional.card.model_dump(mode="json"),
         }
 
     def _pins(self) -> dict[str, Array | None]:
@@ -192,12 +200,12 @@ def resolve(options: Options) -> Resolved:
         margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
     problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
-    conditioned = _guided(method, kinds, path, checkpoint) if isinstance(method, Conditional) else None
+    conditioned = _conditional(kinds, path, checkpoint) if isinstance(method, Conditional) else None
     return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
 
 
-def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Denoiser:
-    """The denoiser of the planner that was trained for these constraints."""
+def _conditional(kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Checkpoint:
+    """The planner that was trained for these constraints."""
     if checkpoint is None:
         raise CdiffError("conditional: this task's score is exact, no planner can be trained for its constraints")
     task = checkpoint.card.task
@@ -210,7 +218,7 @@ def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: 
         raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
     if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
         raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
-    return guided(found.net, method.weight, 1.0 if found.frame is None else RELATIVE_LIMIT)
+    return found
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:
