@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
@@ -157,6 +158,36 @@ def control(
     return log.episodes()
 
 
+@dataclass(frozen=True)
+class _InUnits:
+    """The method on coordinates y = scale * z, which have the units of the environment: what is near is measured there. The scales
+    of z differ a hundredfold along the window, and a method on z would leave the first waypoints, which are all that is
+    executed, as they are. The reverse step is linear, so that it is the same step in y.
+
+    scale   [horizon, dim]
+    """
+
+    method: Method
+    scale: Tensor
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        return self.method.init(x, g)
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        scale = self.scale
+        y = Step(
+            x=scale * step.x,
+            x0=scale * step.x0,
+            beta=step.beta,
+            level=step.level,
+            reverse=lambda clean: scale * step.reverse(clean / scale),
+            pins=Pins(step.pins.mask, scale * step.pins.values),
+            last=step.last,
+        )
+        out, state = self.method.step(y, g, state)
+        return out / scale, state
+
+
 @dataclass
 class _Resumed:
     """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
@@ -229,7 +260,8 @@ def _plan(
         seen = {name: torch.from_numpy(values) for name, values in observed.items()}
         scored, obeyed = (g.bind(seen, controller.task.dt, horizon) for g in (controller.g, controller.enforced))
         like = torch.empty(0, device=device)
-        g = pull_back(obeyed, to.centre, to.scale).to(like)
+        unit = torch.ones_like(to.scale)
+        g = pull_back(obeyed, to.centre, unit).to(like)
         shape = (horizon, states.shape[1])
         mask = torch.zeros(shape, dtype=torch.bool, device=device)
         mask[0] = True
@@ -246,7 +278,7 @@ def _plan(
         z = sample(
             timed,
             schedule,
-            method,
+            _InUnits(method, to.scale.to(like)),
             g,
             pins,
             lambda: next(draws),
@@ -256,8 +288,9 @@ def _plan(
         )
         z64 = z.double().cpu()
         if controller.polish:
-            g64 = pull_back(obeyed.tighten(MARGIN), to.centre, to.scale)
-            z64, _ = project_from(g64, z64, Pins(mask.cpu(), begin), None, 0)
+            g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
+            y, _ = project_from(g64, to.scale * z64, Pins(mask.cpu(), to.scale * begin), None, 0)
+            z64 = y / to.scale
         x = to.decode(z64).numpy()
         x[:, 0] = states
     synchronise(device)
