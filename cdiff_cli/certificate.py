@@ -145,7 +145,7 @@ def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
     else:
         plan, segment = np.arange(len(x)), np.array(at)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = level.worst(_tensor(begin), _tensor(end)).numpy()
+        share = level.worst(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}

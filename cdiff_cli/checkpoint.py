@@ -4,40 +4,49 @@ import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import yaml
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from cdiff_cli.data import Normaliser
 from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.errors import CheckpointError
-from cdiff_cli.networks import TemporalUnet
-from cdiff_cli.recipe import Card, NetworkSpec, home, shown
+from cdiff_cli.frames import Frame
+from cdiff_cli.networks import InverseDynamics, ResidualMlp, TemporalUnet
+from cdiff_cli.recipe import Card, MlpSpec, NetworkSpec, home, shown
+
+Network = TemporalUnet | ResidualMlp
+Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
     """A trained denoiser and what belongs to it.
 
-    dynamics         linear dynamics fitted to the training data, environment units; None where there were no inputs to fit
-
+    normaliser       environment units to those of the network; of control tasks the frame's, of the present state
     demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
+    dynamics         linear dynamics fitted to the training data, environment units; None where there were no inputs to fit
+    frame, inverse   of control tasks: the relative windows, and u = IDM(x^0, x^1)
     """
 
-    net: TemporalUnet
+    net: Network
     normaliser: Normaliser
     demonstrations: Tensor
     card: Card
     path: Path
     dynamics: LinearDynamics | None = None
+    frame: Frame | None = None
+    inverse: InverseDynamics | None = None
 
 
-def build(dim: int, network: NetworkSpec) -> TemporalUnet:
+def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:
     """A network of that size, its weights drawn from the global generator."""
-    return TemporalUnet(dim, **network.model_dump())
+    if isinstance(network, MlpSpec):
+        return ResidualMlp(dim, horizon, network.width, network.depth, network.conditions)
+    return TemporalUnet(dim, **network.model_dump(exclude={"kind"}))
 
 
 def write_safetensors(path: Path, tensors: dict[str, Tensor], facts: dict[str, str] | None = None) -> None:
@@ -112,11 +121,33 @@ def load_checkpoint(path: Path, task: str | None = None, device: torch.device | 
             f"restore it, or {advice}"
         )
     tensors, _ = read_safetensors(path, advice)
-    normaliser = Normaliser(tensors.pop("normaliser.centre"), tensors.pop("normaliser.scale"))
-    windows = tensors.pop("demonstrations")
-    fitted = {name.removeprefix("dynamics."): tensors.pop(name) for name in list(tensors) if name.startswith("dynamics.")}
+    parts: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        part, _, rest = name.partition(".")
+        parts.setdefault(part, {})[rest] = value
+    normaliser, windows = Normaliser(**parts["normaliser"]), parts["demonstrations"][""]
+    dim = windows.shape[-1]
     with torch.random.fork_rng(devices=[]):
-        net = build(windows.shape[-1], card.network)
-    net.load_state_dict({name.removeprefix("net."): value.float() for name, value in tensors.items()})
-    dynamics = LinearDynamics(**fitted) if fitted else None
-    return Checkpoint(net.to(device).eval().requires_grad_(False), normaliser, windows, card, path, dynamics)
+        net = build(dim, card.horizon, card.network)
+    dynamics = LinearDynamics(**parts["dynamics"]) if "dynamics" in parts else None
+    return Checkpoint(
+        _loaded(net, parts["net"], device),
+        normaliser,
+        windows,
+        card,
+        path,
+        dynamics,
+        Frame(normaliser, **parts["frame"]) if "frame" in parts else None,
+        _inverse(parts["inverse"], device) if "inverse" in parts else None,
+    )
+
+
+def _loaded(net: Module, tensors: dict[str, Tensor], device: torch.device | str) -> Module:
+    net.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return net.to(device).eval().requires_grad_(False)
+
+
+def _inverse(tensors: dict[str, Tensor], device: torch.device | str) -> InverseDynamics:
+    with torch.random.fork_rng(devices=[]):
+        net = InverseDynamics(tensors["centre"].shape[1], len(tensors["low"]), len(tensors["layers.0.bias"]))
+    return _loaded(net, tensors, device)

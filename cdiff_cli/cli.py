@@ -3,8 +3,7 @@
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,8 @@ import typer
 from rich.console import Console
 
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.progress import err, progress, training_progress
+from cdiff_cli.runs import METHOD_ORDER
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -20,12 +21,11 @@ app = typer.Typer(
     help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
     epilog="Start with: cdiff plan --method alm",
 )
-err = Console(stderr=True)
 out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width of its own
 
 RUNS = Path("runs")
 TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large or gaussian2d")]
-MethodName = Annotated[str, typer.Option("--method", help="diffuser, projected, primal-dual or alm")]
+MethodName = Annotated[str, typer.Option("--method", help=", ".join(METHOD_ORDER))]
 PresetName = Annotated[str, typer.Option("--preset", help="recommended (ours), paper (as printed), released (the authors' code)")]
 ConstraintFile = Annotated[Path | None, typer.Option("--constraints", help="YAML file of constraints [default: the task's own]")]
 CheckpointFile = Annotated[Path | None, typer.Option("--checkpoint", help="a .safetensors checkpoint [default: the shipped one]")]
@@ -36,6 +36,9 @@ Steps = Annotated[
     int | None,
     typer.Option("--steps", help="diffusion steps, at most as trained; few go best with --kernel dpm++2m [default: the preset's]"),
 ]
+ExtraSteps = Annotated[
+    int | None, typer.Option("--extra-steps", help="further steps with t frozen and no noise [default: the preset's]")
+]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="a method's constant, as rho=0.05; may be repeated")]
 Count = Annotated[int, typer.Option("--n", "--episodes", help="number of plans, one seed each")]
 Seed = Annotated[int, typer.Option("--seed", help="first seed; plans use seed, seed + 1, ...")]
@@ -43,6 +46,19 @@ Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda")]
 Random = Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each plan")]
 NoDynamics = Annotated[bool, typer.Option("--no-dynamics", help="do not obey the fitted dynamics, whatever the preset says")]
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object instead of the table")]
+Execute = Annotated[int | None, typer.Option(help="control: environment steps a plan is followed [default: the preset's]")]
+Warm = Annotated[
+    float | None, typer.Option(help="control: share of the diffusion steps redone on the last plan [default: from noise]")
+]
+MarginSize = Annotated[
+    float | None, typer.Option("--margin", help="control: tighten each h by this [default: the calibrated margins]")
+]
+ActionNoise = Annotated[float, typer.Option(help="control: disturb each input, standard deviation over half its range")]
+Env = Annotated[list[str] | None, typer.Option(help="control: an option of the environment, as pattern=chaser; may be repeated")]
+Calibrate = Annotated[
+    bool, typer.Option("--calibrate", help="control: measure how far execution leaves the plans, write the margins")
+]
+Confidence = Annotated[float, typer.Option("--level", help="--calibrate: share of episodes that the margins are to cover")]
 RunsFolder = Annotated[Path, typer.Option("--runs", help="where runs are kept")]
 
 
@@ -63,37 +79,23 @@ def reported(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@contextmanager
-def progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr: call it with (what, done, of how many)."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    tasks: dict[str, Any] = {}
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-
-        def tick(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
-
-        yield tick
-
-
 @app.command()
 @reported
 def train(
     task: TaskName = "maze2d-umaze",
-    recipe: Annotated[str, typer.Option(help="small (minutes on two cores) or paper (the paper's size)")] = "small",
+    recipe: Annotated[
+        str | None, typer.Option(help="small (minutes on two cores), paper (the paper's size) or conditional [default: small]")
+    ] = None,
+    conditional: Annotated[
+        Path | None, typer.Option(help="YAML file of constraints to train a planner for, which --method conditional uses")
+    ] = None,
     seed: Annotated[int, typer.Option(help="seed of the weights, the noise and the order of the data")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the last saved state of this training")] = False,
     dataset: Annotated[str | None, typer.Option(help="a local Minari dataset id or a D4RL-style .hdf5 [default: generate]")] = None,
     device: Device = "auto",
     runs: RunsFolder = RUNS,
 ) -> None:
-    """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors and its card."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
+    """Train a planner on demonstrations; writes models/TASK/RECIPE.safetensors (or conditional-FILE) and its card."""
     from cdiff_cli import training
     from cdiff_cli.checkpoint import install
     from cdiff_cli.recipe import load_recipe, shown
@@ -101,25 +103,17 @@ def train(
 
     problem = load_task(task)
     plan = load_recipe(task)
-    work = runs / f"train-{task}-{recipe}-{seed}"
-    shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
-    columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
-    with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
-        data, fit = None, None
+    condition = None
+    if conditional is not None:
+        from cdiff_cli.conditioning import Condition, content_sha256
+        from cdiff_cli.spec import load_constraints
 
-        def on_data(done: int, total: int) -> None:
-            nonlocal data
-            data = bar.add_task("demonstrations", total=total, loss="", rate="") if data is None else data
-            bar.update(data, completed=done)
-
-        def on_step(status: training.Status) -> None:
-            nonlocal fit
-            if fit is None:
-                fit = bar.add_task("training", total=status.steps, completed=status.step - 1, loss="", rate="")
-            speed = bar.tasks[-1].speed
-            rate = f"{speed:.1f} steps/s" if speed else ""
-            bar.update(fit, completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
-
+        kinds, g = load_constraints(conditional, problem.name, problem.layout)
+        condition = Condition(conditional.stem, g, content_sha256(kinds))
+    recipe = recipe or ("conditional" if condition else "small")
+    name = f"conditional-{condition.name}" if condition else recipe
+    work = runs / f"train-{task}-{name}-{seed}"
+    with training_progress() as (on_data, on_step):
         try:
             checkpoint = training.train(
                 problem,
@@ -130,6 +124,7 @@ def train(
                 work=work,
                 resume=resume,
                 dataset=dataset,
+                condition=condition,
                 on_data=on_data,
                 on_step=on_step,
             )
@@ -139,7 +134,7 @@ def train(
     card = checkpoint.card
     target = install(checkpoint)
     out.print(f"{card.steps} steps in {card.wall_s / 60:.1f} min on {card.device}: mean squared error {card.mse:.5f}")
-    out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {recipe}.previous.safetensors)", highlight=False)
+    out.print(f"checkpoint {shown(target)} (the one that stood there is kept as {name}.previous.safetensors)", highlight=False)
 
 
 def options(values: dict[str, Any]) -> Any:
@@ -148,13 +143,12 @@ def options(values: dict[str, Any]) -> Any:
 
     from cdiff_cli.request import Options
 
-    values = values | {"settings": tuple(values["settings"] or ())}
+    values = values | {name: tuple(values.get(name) or ()) for name in ("settings", "env")}
     return Options(**{f.name: values[f.name] for f in fields(Options) if f.name in values})
 
 
 def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     """Print a run: its table on stdout, where it lies, its picture, what its certificate says."""
-    from cdiff_cli.certificate import summary
     from cdiff_cli.runs import compare
     from cdiff_cli.tables import render
 
@@ -168,7 +162,7 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
         typer.echo(note)
     typer.echo(f"run          {finished.path}")
     typer.echo(f"picture      {finished.picture}")
-    typer.echo(f"certificate  {summary(finished.counts)}")
+    typer.echo(finished.verdict)
 
 
 def transposed(group: Any, names: tuple[str, ...]) -> None:
@@ -214,6 +208,7 @@ def plan(
     no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
+    extra_steps: ExtraSteps = None,
     settings: Settings = None,
     n: Count = 10,
     seed: Seed = 0,
@@ -248,23 +243,44 @@ def rollout(
     no_dynamics: NoDynamics = False,
     kernel: Kernel = None,
     steps: Steps = None,
+    extra_steps: ExtraSteps = None,
     settings: Settings = None,
     n: Count = 10,
     seed: Seed = 0,
     device: Device = "auto",
+    execute: Execute = None,
+    warm: Warm = None,
+    margin: MarginSize = None,
+    action_noise: ActionNoise = 0.0,
+    env: Env = None,
+    calibrate: Calibrate = False,
+    level: Confidence = 0.95,
     video: Annotated[str | None, typer.Option(help="gif or mp4 of the first episode")] = None,
     runs: RunsFolder = RUNS,
     as_json: AsJson = False,
 ) -> None:
-    """Plan, then follow the plans in the simulator; scores the executed path against the constraints."""
+    """Plan and execute in the simulator, scoring what was executed against the constraints: mazes follow one plan, control
+    tasks (hopper, swimmer, ball-run) plan anew at every step.
+    """
     given = locals()
     if video not in (None, "gif", "mp4"):
         raise CdiffError(f"--video: expected gif or mp4, found {video}")
-    from cdiff_cli.experiment import rollout_run
     from cdiff_cli.request import resolve
-    from cdiff_cli.runs import QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
+    from cdiff_cli.runs import CONTROL_TABLE, QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
 
-    resolved = resolve(options(given))
+    resolved = resolve(options(given | ({"margin": 0.0} if calibrate else {})))
+    if resolved.recipe.frame == "relative":
+        from cdiff_cli import closed_loop
+
+        with progress() as tick:
+            if calibrate:
+                typer.echo(closed_loop.calibrated_text(*closed_loop.calibrate(resolved, tick, level)))
+                return
+            finished = closed_loop.control_run(resolved, runs, tick, video)
+        finish(finished, CONTROL_TABLE, as_json)
+        return
+    from cdiff_cli.experiment import rollout_run
+
     warn_of_speed(resolved)
     with progress() as tick:
         finished = rollout_run(resolved, runs, tick, video)
@@ -302,38 +318,45 @@ def compare(
     folder: Annotated[Path, typer.Argument(help="a folder of runs")] = RUNS,
     style: Annotated[str, typer.Option("--format", help="rich, markdown, latex, csv or json")] = "rich",
     paper: Annotated[bool, typer.Option("--paper", help="the paper's definitions and units, its values beside ours")] = False,
+    intervals: Annotated[bool, typer.Option("--intervals", help="95 %: bootstrap of means, Clopper-Pearson of rates")] = False,
+    against: Annotated[str | None, typer.Option(help="test every method against this one, paired by seed, Holm-corrected")] = None,
+    test: Annotated[str, typer.Option(help="of --against: wilcoxon (signed ranks) or t")] = "wilcoxon",
     task: Annotated[str | None, typer.Option(help="only this task")] = None,
 ) -> None:
     """Compare the runs of a folder: mean ± standard error by task, constraints, method and preset; newest row a seed."""
-    from cdiff_cli import runs, tables
-    from cdiff_cli.errors import suggestion
-    from cdiff_cli.recipe import home
+    from cdiff_cli.comparison import print_comparison
 
-    if style not in tables.FORMATS:
-        raise CdiffError(f'no format "{style}"{suggestion(style, tables.FORMATS)}; choose from {", ".join(tables.FORMATS)}')
-    if not folder.is_dir():
-        raise CdiffError(f"{folder}: no such folder; make a run first: cdiff plan --method alm")
-    plans, rollouts = (([r for r in rows if task in (None, r["task"])]) for rows in runs.merge_kinds(folder))
-    if not plans and not rollouts:
-        raise CdiffError(f"{folder}: no runs{f' of {task}' if task else ''} here; make one first: cdiff plan --method alm")
-    values = tables.read_paper(home() / "runs" / "reference" / "paper.csv") if paper else None
-    plan_table = runs.PAPER_TABLE if paper else runs.PLAN_TABLE
-    wanted = [("plans", plans, plan_table), ("rollouts", rollouts, tuple(dict.fromkeys((*runs.SAFETY_TABLE, *runs.ROLLOUT_TABLE))))]
-    shown = [(title, runs.compare(rows), table) for title, rows, table in wanted if rows]
-    if style == "json":
-        found = {title: json.loads(tables.render(groups, table, style, values)) for title, groups, table in shown}
-        typer.echo(json.dumps(found, indent=2))
-        return
-    for title, groups, table in shown:
-        text = tables.render(groups, table, style, values if title == "plans" else None, title)
-        if style == "rich":
-            out.print(text)
-        else:
-            typer.echo(text)
-    if style == "rich":
-        out.print(
-            "mean ± standard error over n seeds, the newest row of each; a preset with * was changed by an option", style="dim"
-        )
+    print_comparison(folder, out, style=style, paper=paper, intervals=intervals, against=against, test=test, task=task)
+
+
+@app.command()
+@reported
+def sweep(
+    task: Annotated[str, typer.Option(help="tasks, separated by commas")] = "maze2d-umaze",
+    methods: Annotated[str, typer.Option(help="methods, separated by commas")] = "diffuser,projected,primal-dual,alm",
+    presets: Annotated[str, typer.Option(help="presets, separated by commas")] = "recommended",
+    constraints: Annotated[list[Path] | None, typer.Option(help="YAML file of constraints; may be repeated [default: own]")] = None,
+    seeds: Annotated[int, typer.Option(help="number of seeds, a run each")] = 10,
+    seed: Seed = 0,
+    random: Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each seed")] = False,
+    rollout: Annotated[bool, typer.Option("--rollout", help="follow the plans in the simulator too")] = False,
+    jobs: Annotated[int, typer.Option(help="runs at a time, each on one thread")] = 1,
+    backend: Annotated[str, typer.Option(help="local, or a cluster: ray or dask (optional extras)")] = "local",
+    address: Annotated[str | None, typer.Option(help="of the cluster's head, as 127.0.0.1:6379")] = None,
+    runs: RunsFolder = RUNS,
+) -> None:
+    """Make the missing runs of a matrix (task, constraints, preset, method, seed); start it again and it goes on. Exit code 1 where
+    a run failed. `cdiff compare` then prints the table.
+    """
+    from cdiff_cli.sweep import Matrix, run_sweep
+
+    tasks, named, asked = ([name.strip() for name in text.split(",") if name.strip()] for text in (task, methods, presets))
+    matrix = Matrix(tasks, named, asked, constraints or [None], range(seed, seed + seeds), rollout, random)
+    failed = run_sweep(matrix, runs, jobs, err, backend, address)
+    for outcome in failed:
+        typer.echo(f"failed: {outcome.job.name}: {outcome.error}", err=True)
+    typer.echo(f"compare them with: cdiff compare {runs}")
+    raise typer.Exit(1 if failed else 0)
 
 
 @app.command()

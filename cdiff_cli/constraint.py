@@ -5,15 +5,16 @@ trajectory: at every waypoint, or as a discrete control barrier function along i
 an exact form; gradients are written out, so that a method pays for a few vector operations and no autograd graph.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from functools import cached_property
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.levels import Level, Quadric, moved, segment_max
+from cdiff_cli.levels import Framed, Level, Quadric, moved, segment_max, take
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -30,6 +31,22 @@ class Pins:
 
     mask: Bool[Tensor, "horizon dim"]
     values: Traj
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether each waypoint is fixed as a whole or not at all."""
+        return bool((self.mask.all(1) == self.held).all())
+
+    @cached_property
+    def held(self) -> Bool[Tensor, "horizon"]:  # noqa: F821
+        """Waypoints with a fixed coordinate."""
+        return self.mask.any(1)
+
+    @cached_property
+    def loose(self) -> tuple[int, int]:
+        """The first waypoint that is not held, and the one after the last."""
+        free = [tau for tau, held in enumerate(self.held.tolist()) if not held]
+        return (free[0], free[-1] + 1) if free else (0, 0)
 
     @classmethod
     def none(cls, like: Traj) -> "Pins":
@@ -64,11 +81,22 @@ class Part(Protocol):
         """The same part of z, x = centre + scale * z; the rows keep their values and units."""
         ...
 
+    def take(self, which: Tensor) -> Self:
+        """The same part of some plans of the batch alone."""
+        ...
+
     def to(self, like: Tensor) -> Self:
         """The same part with its numbers in the dtype and on the device of `like`."""
         ...
 
-    def shift(self, margin: float) -> Self: ...
+    def shift(self, margin: float) -> Self:
+        """g <= -margin."""
+        ...
+
+    def shift_level(self, margin: float) -> Self:
+        """The level tightened to f <= -margin, a barrier to h >= margin; of a part without a level, g."""
+        ...
+
     def segment_max(self, x: Traj) -> Rows:
         """The largest unsafe value on the segments between waypoints [batch, horizon - 1]."""
         ...
@@ -100,16 +128,21 @@ class Waypoints:
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Waypoints":
         return replace(self, level=self.level.pull_back(centre, scale))
 
+    def take(self, which: Tensor) -> "Waypoints":
+        return replace(self, level=take(self.level, which))
+
     def to(self, like: Tensor) -> "Waypoints":
         return replace(self, level=moved(self.level, like))
 
     def shift(self, margin: float) -> "Waypoints":
         return replace(self, level=self.level.shift(margin))
 
+    shift_level = shift
+
     def segment_max(self, x: Traj) -> Rows:
         if x.shape[1] < 2:
             return self(x)
-        return segment_max(self.level, x[:, :-1], x[:, 1:])
+        return segment_max(self.level, x)
 
     def on_segments(self) -> "tuple[Part, ...]":
         return (self if self.level.convex else _segments(self.name, self.level),)
@@ -131,26 +164,29 @@ class Segments:
         return self.segment_max(x)[:, : x.shape[1] - 1]
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        s = self.level.worst(x[:, :-1], x[:, 1:])[..., None]
-        at = x[:, :-1] + s * (x[:, 1:] - x[:, :-1])
-        slope = self.level.gradient(at)
+        at = self.level.between(x, self.level.worst(x))
 
         def pull(w: Rows) -> Traj:
             out = torch.zeros_like(x)
-            out[:, :-1] += (1 - s) * w[..., None] * slope
-            out[:, 1:] += s * w[..., None] * slope
+            out[:, :-1] += w[..., None] * at.back
+            out[:, 1:] += w[..., None] * at.on
             return out
 
-        return self.level(at), pull, 2 * ((1 - s) ** 2 + s**2)[..., 0] * self.level.size(at)
+        return at.value, pull, 2 * at.size
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Segments":
         return replace(self, level=self.level.pull_back(centre, scale))
+
+    def take(self, which: Tensor) -> "Segments":
+        return replace(self, level=take(self.level, which))
 
     def to(self, like: Tensor) -> "Segments":
         return replace(self, level=moved(self.level, like))
 
     def shift(self, margin: float) -> "Segments":
         return replace(self, level=self.level.shift(margin))
+
+    shift_level = shift
 
     def segment_max(self, x: Traj) -> Rows:
         return Waypoints(self.name, self.level).segment_max(x)
@@ -161,106 +197,109 @@ class Segments:
 
 def _segments(name: str, level: Level) -> Segments:
     """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
-    ball = level.ball() if isinstance(level, Quadric) else None
+    ball = level.ball() if isinstance(level, Quadric | Framed) else None
     return Segments(name, ball or level)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Discrete control barrier function h = -f:  (1 - alpha) h(x^tau) - h(x^{tau+1}) <= 0 (paper, section 5.1)."""
+    """Discrete control barrier function h = -f:  (1 - alpha) h(x^tau) - h(x^{tau+1}) <= 0 (paper, section 5.1).
+
+    level    whose barrier is to stay non-negative
+    alpha2   of a high-order barrier, of psi^tau = h^{tau+1} - (1 - alpha) h^tau:  (1 - alpha2) psi^tau - psi^{tau+1} <= 0
+             (Xiong et al., 2022); None for the plain one
+    ahead    the level that the rows are of, where it is another: of the place that the velocity leads to
+    """
 
     name: str
     level: Level
     alpha: float
+    alpha2: float | None = None
+    ahead: Level | None = None
 
     spans = True
 
+    @property
+    def acting(self) -> Level:
+        """The level that the rows are of."""
+        return self.level if self.ahead is None else self.ahead
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """c with the rows -(c_0 h^tau + c_1 h^{tau+1} + ... + h^{tau+order}) <= 0."""
+        gamma = 1 - self.alpha
+        if self.alpha2 is None:
+            return (-gamma, 1.0)
+        return (gamma * (1 - self.alpha2), -gamma - (1 - self.alpha2), 1.0)
+
     def labels(self, horizon: int) -> list[str]:
-        return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
+        order = len(self.coefficients) - 1
+        return [f"{self.name}@{tau}-{tau + order}" for tau in range(horizon - order)]
+
+    def rows_of(self, f: Rows) -> Rows:
+        """g where the level has the values f at the waypoints."""
+        c, n = self.coefficients, f.shape[1] - len(self.coefficients) + 1
+        if n < 1:
+            return f[:, :0]
+        rows = f[:, len(c) - 1 :]
+        for k, weight in enumerate(c[:-1]):
+            rows = rows + weight * f[:, k : k + n]
+        return rows
 
     def __call__(self, x: Traj) -> Rows:
-        h = -self.level(x)
-        return (1 - self.alpha) * h[:, :-1] - h[:, 1:]
+        return self.rows_of(self.acting(x))
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        slope, keep = self.level.gradient(x), 1 - self.alpha
+        level, c = self.acting, self.coefficients
+        slope, n = level.gradient(x), max(x.shape[1] - len(c) + 1, 0)
 
         def pull(w: Rows) -> Traj:
-            out = torch.zeros_like(x)
-            out[:, :-1] -= keep * w[..., None] * slope[:, :-1]
-            out[:, 1:] += w[..., None] * slope[:, 1:]
-            return out
+            spread = w.new_zeros(len(w), x.shape[1])
+            for k, weight in enumerate(c):
+                spread[:, k : k + n] += weight * w
+            return spread[..., None] * slope
 
-        size = self.level.size(x)
-        return self(x), pull, (1 + keep) ** 2 * torch.maximum(size[:, :-1], size[:, 1:])
+        size = level.size(x)
+        largest = size[:, :n]
+        for k in range(1, len(c)):
+            largest = torch.maximum(largest, size[:, k : k + n])
+        return self(x), pull, sum(abs(weight) for weight in c) ** 2 * largest
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Chain":
-        return replace(self, level=self.level.pull_back(centre, scale))
+        return self._each(lambda level: level.pull_back(centre, scale))
+
+    def take(self, which: Tensor) -> "Chain":
+        return self._each(lambda level: take(level, which))
 
     def to(self, like: Tensor) -> "Chain":
-        return replace(self, level=moved(self.level, like))
+        return self._each(lambda level: moved(level, like))
 
     def shift(self, margin: float) -> "Chain":
-        """g <= -margin is the same chain over h - margin / alpha."""
-        return replace(self, level=self.level.shift(margin / self.alpha))
+        """g <= -margin is the same chain over h - margin / alpha, or / (alpha alpha2)."""
+        return self.shift_level(margin / sum(self.coefficients))
+
+    def shift_level(self, margin: float) -> "Chain":
+        return self._each(lambda level: level.shift(margin))
+
+    def _each(self, change: Callable[[Level], Level]) -> "Chain":
+        return replace(self, level=change(self.level), ahead=None if self.ahead is None else change(self.ahead))
 
     def segment_max(self, x: Traj) -> Rows:
         """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
         return Waypoints(self.name, self.level).segment_max(x)
 
     def on_segments(self) -> "tuple[Part, ...]":
-        """The chain, and its barrier on the segments where the waypoints' safety does not give it."""
-        return (self,) if self.level.convex else (self, _segments(self.name, self.level))
+        """The chain, and its barrier on the segments where the chain does not give it."""
+        if not self.level.convex:
+            return (self, _segments(self.name, self.level))
+        return (self,) if self.ahead is None else (self, Waypoints(self.name, self.level))
 
 
-@dataclass(frozen=True)
-class Opaque:
-    """Rows of which only the function is known: differentiated by autograd, projected by sequential linearisation.
+@runtime_checkable
+class Bindable(Protocol):
+    """A part that waits for observed quantities (observed.py)."""
 
-    fn      trajectory in environment units -> rows, differentiable
-    count   number of rows at a horizon
-    """
-
-    name: str
-    fn: Callable[[Traj], Rows]
-    count: Callable[[int], int]
-    margin: float = 0.0
-
-    spans = True
-
-    def labels(self, horizon: int) -> list[str]:
-        return [f"{self.name}@{i}" for i in range(self.count(horizon))]
-
-    def __call__(self, x: Traj) -> Rows:
-        return self.fn(x) + self.margin
-
-    def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        with torch.enable_grad():
-            leaf = x.detach().clone().requires_grad_()
-            rows = self(leaf)
-
-            def pull(w: Rows) -> Traj:
-                return torch.autograd.grad(rows, leaf, w, retain_graph=True)[0]
-
-        size = pull(torch.ones_like(rows)).square().sum((1, 2))
-        return rows.detach(), pull, size[:, None].expand_as(rows)
-
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Opaque":
-        fn = self.fn
-        return replace(self, fn=lambda z: fn(centre.to(z) + scale.to(z) * z))
-
-    def to(self, like: Tensor) -> "Opaque":
-        return self
-
-    def shift(self, margin: float) -> "Opaque":
-        return replace(self, margin=self.margin + margin)
-
-    def segment_max(self, x: Traj) -> Rows:
-        return self(x)
-
-    def on_segments(self) -> "tuple[Part, ...]":
-        """Nothing is known of it between the waypoints."""
-        return (self,)
+    def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> tuple[Part, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -268,6 +307,13 @@ class Constraint:
     """g(x) <= 0, row by row: a tuple of parts, each in environment units or all pulled back."""
 
     parts: tuple[Part, ...]
+
+    def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> "Constraint":
+        """The constraint with observed quantities filled in, each [batch], at waypoints dt seconds apart."""
+        if not any(isinstance(part, Bindable) for part in self.parts):
+            return self
+        bound = [part.bind(observed, dt, horizon) if isinstance(part, Bindable) else (part,) for part in self.parts]
+        return Constraint(tuple(part for parts in bound for part in parts))
 
     def __call__(self, x: Traj) -> Rows:
         rows = [part(x) for part in self.parts]
@@ -299,6 +345,10 @@ class Constraint:
         """The constraint g <= -margin (margin in the units of g)."""
         return Constraint(tuple(part.shift(margin) for part in self.parts))
 
+    def take(self, which: Tensor) -> "Constraint":
+        """The same constraint of some plans of the batch alone."""
+        return Constraint(tuple(part.take(which) for part in self.parts))
+
     def to(self, like: Tensor) -> "Constraint":
         """The same constraint with its numbers in the dtype and on the device of `like`."""
         return Constraint(tuple(part.to(like) for part in self.parts))
@@ -310,5 +360,8 @@ def stack(constraints: Sequence[Constraint]) -> Constraint:
 
 
 def pull_back(g: Constraint, centre: Tensor, scale: Tensor) -> Constraint:
-    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units."""
+    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units.
+
+    centre, scale   [dim], or by plan and waypoint: [horizon | 1, dim] or [batch | 1, horizon | 1, dim]
+    """
     return Constraint(tuple(part.pull_back(centre, scale) for part in g.parts))

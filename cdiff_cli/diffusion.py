@@ -24,7 +24,7 @@ Kernel = Callable[[Traj, Traj, Traj, float, float, Previous | None], Traj]
 class Estimator(Protocol):
     """A network to be trained: estimates of the clean trajectory [batch, horizon / k, dim] from coarse to the output."""
 
-    def estimates(self, x: Traj, t: Tensor) -> list[Traj]: ...
+    def estimates(self, x: Traj, t: Tensor, condition: Tensor | None = None) -> list[Traj]: ...
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,10 @@ class Schedule:
         wanted = (round(self.n_steps * (k / n_steps) ** 1.5) for k in range(1, n_steps + 1))
         keep = list(accumulate(wanted, lambda before, i: max(before + 1, i), initial=0))  # each step once; convex, so it ends at n
         return Schedule(tuple(self.alpha_bar[i] for i in keep), tuple(self.t[i] for i in keep))
+
+    def until(self, n_steps: int) -> "Schedule":
+        """The last steps alone, those nearest the data."""
+        return Schedule(self.alpha_bar[: n_steps + 1], self.t[: n_steps + 1])
 
 
 def ddpm(x: Traj, x0: Traj, z: Traj, a: float, b: float, previous: Previous | None = None) -> Traj:  # noqa: ARG001
@@ -118,6 +122,7 @@ class Step:
     level     sqrt(alpha_bar_{t-1}), the share of the clean trajectory in x_{t-1}
     reverse   clean estimate -> x_{t-1}; noise z and pins already bound; the next step's kernel knows the last estimate given
     last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
+    left      denoising steps still to come: 0 in the last and in the frozen ones
     """
 
     x: Traj
@@ -127,6 +132,7 @@ class Step:
     reverse: Callable[[Traj], Traj]
     pins: Pins
     last: bool
+    left: int = 0
 
 
 class Method(Protocol):
@@ -166,14 +172,16 @@ def sample(
     *,
     kernel: Kernel = ddpm,
     extra_steps: int = 0,
+    first: Traj | None = None,
     on_step: Callable[[int, Step, Traj], None] | None = None,
 ) -> Traj:
     """Plans x_0 in normalised coordinates [batch, horizon, dim].
 
+    first        x_T, the schedule's noisiest; drawn where None
     extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
     on_step      called with the number of network calls so far, the step and x_{t-1}
     """
-    x = pins.paint(noise())
+    x = pins.paint(noise() if first is None else first)
     state = method.init(x, g)
     used: Previous | None = None
     for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):
@@ -188,7 +196,7 @@ def sample(
             used = clean, a
             return pins.paint(kernel(x, clean, z, a, b, previous))
 
-        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last)
+        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last, i - 1)
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)
@@ -196,7 +204,14 @@ def sample(
 
 
 def training_loss(
-    net: Estimator, schedule: Schedule, x0: Traj, pinned: Tensor, weighing: "Weighing", generator: torch.Generator, bf16: bool
+    net: Estimator,
+    schedule: Schedule,
+    x0: Traj,
+    pinned: Tensor,
+    weighing: "Weighing",
+    generator: torch.Generator,
+    bf16: bool,
+    condition: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """(loss, mean squared error) of the clean estimate at random steps t, both scalars.
 
@@ -205,13 +220,14 @@ def training_loss(
 
     x0      clean windows, normalised                          [batch, horizon, dim]
     pinned  coordinates given clean, as they are in sampling   [horizon, dim]
+    condition   labels of the windows, of conditional planners [batch, k]
     """
     t = torch.randint(1, schedule.n_steps + 1, (len(x0),), generator=generator)
     z = torch.randn(x0.shape, generator=generator).to(x0)
     a = torch.tensor(schedule.alpha_bar, dtype=x0.dtype)[t].to(x0)[:, None, None]
     x_t = torch.where(pinned, x0, a.sqrt() * x0 + (1 - a).sqrt() * z)
     with torch.autocast(x0.device.type, torch.bfloat16, enabled=bf16):
-        *coarse, estimate = net.estimates(x_t, t.to(x0))
+        *coarse, estimate = net.estimates(x_t, t.to(x0), *(() if condition is None else (condition,)))
     w = weighing.of(schedule).to(x0)[t][:, None, None]
     e = torch.where(pinned, 0.0, estimate.float() - x0)
     loss = (w * e.square()).mean() + weighing.smoothness * (w * e.diff(dim=1).square()).mean()

@@ -5,7 +5,7 @@ import json
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli import figures, metrics
-from cdiff_cli.certificate import Saved, certificate
+from cdiff_cli.certificate import Saved, certificate, summary
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.planning import Plans, Rollout, follow, plan
@@ -29,31 +29,42 @@ Tick = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is on disk, and what the command prints of it."""
+    """A run that is on disk, and what the command prints of it: its rows, its picture, its verdict in a line and in numbers."""
 
     path: Path
     rows: list[Row]
     picture: Path
     counts: dict[str, int | None]
+    verdict: str
     notes: tuple[str, ...] = ()
 
 
-def plan_run(resolved: Resolved, root: Path, tick: Tick) -> Finished:
-    """Plan, measure, write runs/<stamp>-plan-.../"""
+def plan_run(resolved: Resolved, root: Path, tick: Tick, *, name: str | None = None, pictures: bool = True) -> Finished:
+    """Plan, measure, write runs/<stamp>-plan-.../, or <stamp>-<name>"""
     plans, free = _plan_both(resolved, tick)
     rows = _plan_rows(resolved, plans, free)
     notes = []
-    with new_run(root, _name("plan", resolved)) as run:
+    with new_run(root, name or _name("plan", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
         counts = _write_certificate(run.path, resolved, plans.x)
-        _plan_pictures(run.path, resolved, plans, free)
-        if plans.chain is not None and resolved.problem.horizon == 1:
+        if pictures:
+            _plan_pictures(run.path, resolved, plans, free)
+        if pictures and plans.chain is not None and resolved.problem.horizon == 1:
             notes.append(_chain_figure(run.path, resolved, plans))
-    return Finished(run.path, rows, run.path / "plan.png", counts, tuple(notes))
+    return Finished(run.path, rows, run.path / "plan.png", counts, f"certificate  {summary(counts)}", tuple(notes))
 
 
-def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = None, hold: int = 100) -> Finished:
-    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../"""
+def rollout_run(
+    resolved: Resolved,
+    root: Path,
+    tick: Tick,
+    video: str | None = None,
+    hold: int = 100,
+    *,
+    name: str | None = None,
+    pictures: bool = True,
+) -> Finished:
+    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
     task = resolved.problem.task
     if not hasattr(task, "track"):
         raise CdiffError(f"{task.name} has no environment to roll out in; plan it with `cdiff plan --task {task.name}`")
@@ -62,18 +73,19 @@ def rollout_run(resolved: Resolved, root: Path, tick: Tick, video: str | None = 
     done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n), plans.u)
     measured = metrics.rollout_metrics(resolved.problem.g, done.x, done.reward, done.success, done.goal_distance)
     rows = [row | more for row, more in zip(_plan_rows(resolved, plans, free), measured, strict=True)]
-    with new_run(root, _name("rollout", resolved)) as run:
+    with new_run(root, name or _name("rollout", resolved)) as run:
         _write_plans(run.path, resolved, plans, free, rows)
         _write_rollout(run.path, resolved, done)
         counts = _write_certificate(run.path, resolved, plans.x, done.x)
-        _plan_pictures(run.path, resolved, plans, free)
-        title = f"{task.name}, {resolved.options.method}: executed over planned"
-        figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
+        if pictures:
+            _plan_pictures(run.path, resolved, plans, free)
+            title = f"{task.name}, {resolved.options.method}: executed over planned"
+            figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
         if video:
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)
             tick("video", 1, 1)
-    return Finished(run.path, rows, run.path / "rollout.png", counts)
+    return Finished(run.path, rows, run.path / "rollout.png", counts, f"certificate  {summary(counts)}")
 
 
 def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
@@ -86,19 +98,20 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         kernel=resolved.kernel,
         on_step=lambda call: tick("diffuser", call, calls),
     )
-    if isinstance(resolved.method, Unconstrained):
+    if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
         return free, free
-    total = calls + resolved.preset.extra_steps
+    total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
+    problem = resolved.problem if resolved.guided is None else replace(resolved.problem, denoiser=resolved.guided)
     plans = plan(
-        resolved.problem,
+        problem,
         resolved.method,
         resolved.seeds,
         kernel=resolved.kernel,
-        extra_steps=resolved.preset.extra_steps,
+        extra_steps=resolved.extra_steps,
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )
-    return plans, free
+    return replace(plans, calls=resolved.calls_a_step * plans.calls), free
 
 
 def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:

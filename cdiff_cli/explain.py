@@ -10,6 +10,7 @@ from cdiff_cli import figures
 from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
 from cdiff_cli.dynamics import Reachable
+from cdiff_cli.observed import Observed
 from cdiff_cli.projection import has_exact_form
 from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.spec import load_constraints
@@ -27,22 +28,26 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     task, recipe = load_task(name), load_recipe(name)
     shipped = home() / "models" / name / "small.safetensors"
     checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
-    kinds, g = load_constraints(file, name, task.layout, checkpoint.dynamics if checkpoint else None)
+    fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
+    kinds, g = load_constraints(file, name, task.layout, fitted, observable)
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
     for heading in ("name", "kind", "meaning", "rows", "coordinates", "projection", "demonstrations that obey"):
         table.add_column(heading, overflow="fold")
     for spec, part in zip(kinds, g.parts, strict=True):
+        form = part.example(recipe.horizon)[0] if isinstance(part, Observed) else part  # its form, where its numbers are observed
         used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
-        obey = "" if demonstrations is None else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+        obey = (
+            "" if demonstrations is None or form is not part else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+        )
         table.add_row(
             spec.name,
             spec.kind,
             spec.describe(),
-            str(len(part.labels(recipe.horizon))),
+            str(len(form.labels(recipe.horizon))),
             ", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used),
-            "exact" if has_exact_form(part) else "ADMM" if isinstance(part, Reachable) else "sequential (ProxQP)",
+            "exact" if has_exact_form(form) else "ADMM" if isinstance(form, Reachable) else "sequential (ProxQP)",
             obey,
         )
     out.print(table)

@@ -3,8 +3,11 @@
 Every method is the plain step x_{t-1} = reverse(x0) with two holes: the clean estimate x0 may be changed before it, the
 sample after it. `on` says where g is evaluated and where the change is made:
 
-noisy   at x_t, the change made to x_{t-1}: the paper's
-clean   at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
+noisy     at x_t, the change made to x_{t-1}: the paper's
+estimate  at the clean estimate x0, the change made to x_{t-1}: ours for control; multipliers alone
+clean     at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
+
+What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
 
 from collections.abc import Mapping
@@ -14,21 +17,20 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 import torch
 from torch.nn import functional as F
 
+from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import Warm, dynamics_of, split
+from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
+from cdiff_cli.safediffuser import SafeDiffuser
 
 On = Literal["noisy", "clean"]
+DualOn = Literal["noisy", "estimate", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
 Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
-DYNAMICS_FROM = 0.995
-"""Of 0, 0.9, 0.95 and 0.995 the one with the smallest distance, all as safe when executed: alm on maze2d-umaze-disc and -slalom,
-100 random pairs, seed 2000.
-"""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Projected:
         return None
 
     def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
-        g = due(g, step, self.dynamics_from)
+        g = due(g, step.level, self.dynamics_from)
         if self.on == "clean":
             x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
             if self.correction == "kernel":
@@ -76,6 +78,7 @@ class PrimalDual:
 
     noisy:  x_{t-1} = reverse(x0) - c_t lam_t^T dg(x_t)               (paper, Eq. pri)
             lam_{t-1} = [lam_t + eta E g(x_t)]_+                      (paper, Eq. dual)
+    estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
     With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
@@ -87,7 +90,7 @@ class PrimalDual:
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
 
-    on: On = "clean"
+    on: DualOn = "clean"
     eta: float = 1.0
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
@@ -100,12 +103,12 @@ class PrimalDual:
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
-        if self.on == "noisy":
-            rows, pull, _ = linearise(g, step.x, self.positive)
+        if self.on != "clean":
+            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
-        g, dynamics = split(due(g, step, self.dynamics_from))
+        g, dynamics = split(due(g, step.level, self.dynamics_from))
         rows, pull, size = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
@@ -128,6 +131,7 @@ class AugmentedLagrangian:
 
     s_t = [-E g - lam_t / rho_t]_+,  m = lam_t + rho_t (E g + s_t) = [lam_t + rho_t E g]_+
     noisy:  g at x_t,  x_{t-1} = reverse(x0) - c_t m^T dg(x_t)
+    estimate:  the same with g and dg at x0
     clean:  g at x0 - lam_t^T dg(x0), the estimate as the multipliers known so far push it;
             x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
     lam_{t-1} = m,  rho_{t-1} = c rho_t
@@ -142,7 +146,7 @@ class AugmentedLagrangian:
     coefficient, expectation, positive   as in PrimalDual
     """
 
-    on: On = "clean"
+    on: DualOn = "clean"
     rho: float = 0.5
     c: float = 1.02
     inner: int = 1
@@ -157,12 +161,12 @@ class AugmentedLagrangian:
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
         lam, rho, _ = state
-        if self.on == "noisy":
-            rows, pull, _ = linearise(g, step.x, self.positive)
+        if self.on != "clean":
+            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
-        g = due(g, step, self.dynamics_from)
+        g = due(g, step.level, self.dynamics_from)
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
             return step.reverse(x0), AlmState(lam, rho, warm)
@@ -177,6 +181,12 @@ class AugmentedLagrangian:
 
 METHODS: dict[str, type[Method]] = {
     "diffuser": Unconstrained,
+    "guidance": Guidance,
+    "conditional": Conditional,
+    "best-of-k": BestOf,
+    "final-projection": FinalProjection,
+    "terminal": Terminal,
+    "safediffuser": SafeDiffuser,
     "projected": Projected,
     "primal-dual": PrimalDual,
     "alm": AugmentedLagrangian,
@@ -224,11 +234,6 @@ def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, R
     gate = torch.sigmoid(rows)
     slope = gate * (1 + rows * (1 - gate))
     return F.silu(rows), lambda w: pull(w * slope), size
-
-
-def due(g: Constraint, step: Step, dynamics_from: float) -> Constraint:
-    """g, without its dynamics while the sample is still too noisy for them."""
-    return g if step.level >= dynamics_from else split(g)[0]
 
 
 def zeros(x: Traj, g: Constraint, expectation: Expectation) -> Rows:

@@ -3,7 +3,8 @@
 x is always [n, horizon, dim]; g is the compiled constraint in environment units, positive where unsafe.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,16 @@ def worst_segment(g: Constraint, x: Array) -> Array:
     """Largest g on the straight segments between waypoints [n], exact for half-spaces, quadrics, balls and ellipsoids."""
     each = [part.segment_max(torch.from_numpy(x)) for part in g.parts]
     return _largest(torch.cat(each, 1) if each else torch.empty(len(x), 0, dtype=torch.float64)).numpy()
+
+
+def unsafe_segments(g: Constraint, x: Array) -> Array:
+    """Number of segments between waypoints [n] on which some g exceeds SAFE; parts that say nothing of segments are left out."""
+    unsafe = torch.zeros(len(x), max(x.shape[1] - 1, 1), dtype=torch.bool)
+    for part in g.parts:
+        rows = part.segment_max(torch.from_numpy(x))
+        if part.spans and rows.shape == unsafe.shape:
+            unsafe |= rows > SAFE
+    return unsafe.sum(1).double().numpy()
 
 
 def distance(x: Array, x_free: Array, columns: Sequence[int], power: float = 1.0) -> Array:
@@ -98,6 +109,7 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "violation": violation(g, x),
         "worst_waypoint": worst_waypoint(g, x),
         "worst_segment": worst_segment(g, x),
+        "unsafe_segments": unsafe_segments(g, x),
         "safe_waypoints": (worst_waypoint(g, x) <= SAFE).astype(np.float64),
         "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),
@@ -138,6 +150,59 @@ def rollout_metrics(
         }
         for i in range(len(x))
     ]
+
+
+def level_values(g: Constraint, x: Array) -> Array:
+    """Value of each part's level at every state [n, steps + 1, parts]: -h of a barrier; of a part without, its largest row."""
+    states = torch.from_numpy(np.ascontiguousarray(x, dtype=np.float64))
+    each = []
+    for part in g.parts:
+        level = getattr(part, "level", None)
+        each.append(part(states).amax(1, keepdim=True).expand(x.shape[:2]) if level is None else level(states))
+    return np.stack([np.asarray(values) for values in each], -1) if each else np.empty((*x.shape[:2], 0))
+
+
+def executed_levels(g: Constraint, x: Array, observed: Mapping[str, Array], dt: float) -> Array:
+    """The same of executed states, each against what was observed at its own time [n, steps + 1, parts].
+
+    observed   quantities by name, each [n, steps + 1]
+    """
+    flat = {name: torch.from_numpy(values.reshape(-1)) for name, values in observed.items()}
+    return level_values(g.bind(flat, dt, 1), x.reshape(-1, 1, x.shape[-1])).reshape(*x.shape[:2], len(g.parts))
+
+
+def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -> list[dict[str, float]]:
+    """The metrics of each closed-loop episode.
+
+    episodes   as control.py returns them
+    levels     of the executed states [n, steps + 1, parts], by executed_levels
+    bounds     lowest and highest input [m]
+    """
+    over = np.nan_to_num(levels, nan=-np.inf).max(-1, initial=-np.inf)
+    steps = np.isfinite(episodes.reward).sum(1)
+    saturated = (np.abs(episodes.u - bounds[0]) < 1e-6) | (np.abs(episodes.u - bounds[1]) < 1e-6)
+    rows = []
+    for i, (worst, count) in enumerate(zip(over, steps, strict=True)):
+        made = episodes.violation[i][np.isfinite(episodes.violation[i])]
+        excess = np.clip(np.nan_to_num(levels[i], nan=0.0), 0.0, None)
+        row = {
+            "reward": float(np.nansum(episodes.reward[i])),
+            "plan_violation": float(made.mean()) if len(made) else math.nan,
+            "safe_plans": float((made <= SAFE).mean()) if len(made) else math.nan,
+            "safe_executed": float(not (worst > SAFE).any()),
+            "executed_violation": float(excess.sum()),
+            "executed_worst": float(worst.max(initial=-np.inf)),
+            "violation_rate": 100.0 * float((worst > SAFE).sum()) / max(int(count) + 1, 1),
+            "fell": float(episodes.fell[i]),
+            "diverged": float(episodes.diverged[i]),
+            "saturation": 100.0 * float(saturated[i, :count].mean()) if count else math.nan,
+            "steps": float(count),
+            "latency_ms": 1e3 * float(np.median(episodes.latency_s)),
+            "latency_p95": 1e3 * float(np.quantile(episodes.latency_s, 0.95)),
+            "overhead": 100.0 * float(np.median(episodes.latency_s / episodes.network_s) - 1.0),
+        }
+        rows.append(row | {f"{name}s": float(np.nansum(told[i])) for name, told in episodes.info.items() if name == "contact"})
+    return rows
 
 
 def boundary_mass(g: Constraint, x: Array, within: float) -> float:

@@ -23,6 +23,8 @@ class TemporalUnet(nn.Module):
              trajectory made at each level on the way up and fed back there: walls are sharp functions of the position, which
              convolutions of z alone learn slowly
 
+    conditions  entries of a label that the estimate can be conditioned on (conditioning.py)
+
     dim         number of coordinates of a waypoint
     width       channels of the first level
     multipliers channels of each level, in units of width; the horizon must divide by patch * 2^(levels - 1)
@@ -38,6 +40,7 @@ class TemporalUnet(nn.Module):
         *,
         patch: int = 1,
         octaves: int = 0,
+        conditions: int = 0,
         ends: tuple[int, ...] = (0, -1),
         ramp: int = 16,
     ) -> None:
@@ -75,19 +78,20 @@ class TemporalUnet(nn.Module):
             self.recall = nn.ModuleList(nn.Conv1d(dim * (1 + 2 * octaves), c, 1) for c in reversed(channels))
             self.last = ResidualBlock(channels[0], channels[0], width)
         self.head = nn.Sequential(ConvBlock(channels[0], channels[0]), nn.Conv1d(channels[0], dim, 1))
+        self.condition = _condition(conditions, width)
 
-    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+    def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
         """The clean estimate [batch, horizon, dim] of the noisy trajectories x at the diffusion steps t [batch]."""
-        return self.estimates(x, t)[-1]
+        return self.estimates(x, t, condition)[-1]
 
-    def estimates(self, x: Tensor, t: Tensor) -> list[Tensor]:
+    def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
         """Estimates of the clean trajectory, of rising resolution [batch, horizon / k, dim]: the last one is the output, the
         others (none without octaves) estimate means over k waypoints and are trained along.
         """
         pinned = [x[:, [end]] for end in self.ends]
         features = [torch.cat((state, *self._fourier(state)), -1).expand(-1, x.shape[1], -1) for state in pinned]
         h = self.stem(torch.cat((x, *features), -1).transpose(1, 2))
-        step = self.embed(t)
+        step = self.embed(t) if condition is None else self.embed(t) + self.condition(condition)
         skips, guesses = [], []
 
         def look(level: int, h: Tensor) -> Tensor:
@@ -128,6 +132,73 @@ class TemporalUnet(nn.Module):
         tau = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
         share = (1 - tau / max(ramp, 1)).clamp_min(0.0)[:, None]
         return share if end == 0 else share.flip(0)
+
+
+class ResidualMlp(nn.Module):
+    """A residual network on the whole window at once, for the short windows of control: it predicts the clean window from a noisy
+    one whose first waypoint is given.
+
+    Blocks h + W2 silu(W1 norm(h) + step), all of the same width.
+
+    horizon, dim   of a window
+    width, depth   channels and number of the blocks
+    """
+
+    def __init__(self, dim: int, horizon: int, width: int = 256, depth: int = 3, conditions: int = 0) -> None:
+        nn.Module.__init__(self)
+        self.embed = nn.Sequential(SinusoidalStep(64), nn.Linear(64, width), nn.SiLU(), nn.Linear(width, width))
+        self.stem = nn.Linear(horizon * dim, width)
+        self.blocks = nn.ModuleList(
+            nn.ModuleList((nn.LayerNorm(width), nn.Linear(width, width), nn.Linear(width, width))) for _ in range(depth)
+        )
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, (horizon - 1) * dim))
+        self.condition = _condition(conditions, width)
+
+    def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
+        """The clean estimate [batch, horizon, dim] of the noisy windows x at the diffusion steps t [batch]."""
+        return self.estimates(x, t, condition)[-1]
+
+    def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
+        """As TemporalUnet.estimates; there is one."""
+        h, step = self.stem(x.flatten(1)), self.embed(t)
+        step = step if condition is None else step + self.condition(condition)
+        for norm, inward, outward in cast(Any, self.blocks):
+            h = h + outward(F.silu(inward(norm(h)) + step))
+        ahead = self.head(h).to(x).unflatten(1, (x.shape[1] - 1, x.shape[2]))
+        return [torch.cat((x[:, :1], ahead), 1)]
+
+
+class InverseDynamics(nn.Module):
+    """u = IDM(x, x'): the input that leads from a state to another, a network on the normalised state and the normalised change.
+
+    centre, scale      of the state, environment units            [2, dim]: of x, of x' - x
+    low, high          bounds of the input, which u is kept in    [m]
+    """
+
+    def __init__(self, dim: int, inputs: int, width: int = 256) -> None:
+        nn.Module.__init__(self)
+        for name, shape in (("centre", (2, dim)), ("scale", (2, dim)), ("low", (inputs,)), ("high", (inputs,))):
+            self.register_buffer(name, torch.ones(shape) if name == "scale" else torch.zeros(shape))
+        self.layers = nn.Sequential(
+            nn.Linear(2 * dim, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, inputs)
+        )
+
+    def raw(self, x: Tensor, after: Tensor) -> Tensor:
+        """The input before it is clipped [batch, m], of states and their successors [batch, dim], environment units."""
+        centre, scale = cast(Tensor, self.centre), cast(Tensor, self.scale)
+        seen = torch.cat(((x - centre[0]) / scale[0], (after - x - centre[1]) / scale[1]), -1)
+        return cast(Tensor, self.layers(seen))
+
+    def forward(self, x: Tensor, after: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(self.raw(x, after), cast(Tensor, self.low)), cast(Tensor, self.high))
+
+
+def _condition(conditions: int, width: int) -> nn.Module:
+    """Labels [batch, conditions] into the embedding of the diffusion step: linear, so that zeros mean none, and zero at first."""
+    layer = nn.Linear(conditions, width, bias=False) if conditions else nn.Identity()
+    if isinstance(layer, nn.Linear):
+        nn.init.zeros_(layer.weight)
+    return layer
 
 
 def _spline(knots: Tensor, patch: int) -> Tensor:

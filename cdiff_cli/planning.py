@@ -2,19 +2,21 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cdiff_cli.baselines import BestOf
 from cdiff_cli.constraint import Constraint, Pins, Traj, pull_back
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Noise, Schedule, Step, sample
 from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
+from cdiff_cli.observed import require_bound
 from cdiff_cli.projection import ADMM_ROUNDS, project, project_from
 from cdiff_cli.tasks import Task
 
@@ -67,11 +69,11 @@ class Plans:
     u: Array | None = None
 
 
-def network_denoiser(net: torch.nn.Module) -> Denoiser:
+def network_denoiser(net: torch.nn.Module, limit: float = 1.0) -> Denoiser:
     """x_t, t -> the network's clean estimate, clipped to the data's limits."""
 
     def clean(x: Traj, t: int) -> Traj:
-        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-1.0, 1.0)
+        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-limit, limit)
 
     return clean
 
@@ -110,6 +112,9 @@ def plan(
     on_step: Callable[[int], None] | None = None,
 ) -> Plans:
     """One plan a seed. Equal seeds meet equal noise whatever the method, so differences between methods are paired."""
+    require_bound(problem.g)
+    if isinstance(method, BestOf):
+        return _best_of(problem, method.k, seeds, kernel, extra_steps, on_step)
     device, dim = problem.device, len(problem.task.layout)
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
@@ -173,6 +178,38 @@ def plan(
     )
 
 
+def _best_of(
+    problem: Problem, k: int, seeds: Sequence[int], kernel: str, extra_steps: int, on_step: Callable[[int], None] | None
+) -> Plans:
+    """Of k unconstrained plans a seed the one with the least sum of [g]_+, g as enforced but for the dynamics; the first, of the
+    seed's own noise, among equals. Nothing is polished.
+    """
+    g = split(problem.enforced)[0]
+    tries: list[Plans] = []
+    for j in range(k):
+        made = tries[0].calls * j if tries else 0
+        tell = None if on_step is None else lambda call, made=made: on_step(made + call)
+        noise = [candidate_seed(seed, j) for seed in seeds]
+        tries.append(plan(problem, Unconstrained(), noise, kernel=kernel, extra_steps=extra_steps, on_step=tell))
+    unsafe = np.stack([g(torch.from_numpy(one.x)).clamp_min(0).sum(1).numpy() for one in tries])
+    best, each = unsafe.argmin(0), np.arange(len(seeds))
+    chains = [one.chain for one in tries if one.chain is not None]
+    return replace(
+        tries[0],
+        x=np.stack([one.x for one in tries])[best, each],
+        trace=np.stack([one.trace for one in tries])[best, :, :, each].transpose(1, 2, 0),
+        chain=np.stack(chains)[best, :, each].swapaxes(0, 1) if chains else None,
+        calls=sum(one.calls for one in tries),
+        total_s=sum(one.total_s for one in tries),
+        network_s=sum(one.network_s for one in tries),
+    )
+
+
+def candidate_seed(seed: int, j: int) -> int:
+    """The seed of candidate j: the seed itself, then draws that no neighbouring seed shares."""
+    return seed if j == 0 else int(np.random.SeedSequence((seed, j)).generate_state(1)[0])
+
+
 def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
     """Project finished plans in float64 onto the constraints tightened a little; also the largest displacement [n] and, where
     dynamics were to be obeyed, the inputs: the plan is then what they produce, to rounding.
@@ -199,7 +236,7 @@ def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array
     todo, warm = torch.arange(len(z)), None
     x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
     for tolerance in (5e-4, 5e-5, 5e-6):
-        near, warm = project_from(g, z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
+        near, warm = project_from(g.take(todo), z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
         assert warm is not None
         u[todo] = torch.clamp(warm.u, dynamics.low, dynamics.high)
         x[todo] = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), u[todo]))

@@ -4,7 +4,7 @@
 
 half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
-control-barrier chain over a half-space or a ball        weighted isotonic regression (pooled adjacent violators)
+control-barrier chain over a half-space or a ball        weighted isotonic regression, or of high order a small QP (chains.py)
 linear dynamics with bounded inputs, and any of these    ADMM on the inputs (dynamics.py), a local solution
 several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
@@ -20,11 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cdiff_cli.closed_forms import nearest, nearest_on_chain
+from cdiff_cli.approach import Approach
+from cdiff_cli.chains import nearest_on_chain
+from cdiff_cli.closed_forms import nearest
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.levels import Affine, Ellipsoid, Quadric
+from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
 from cdiff_cli.segments import nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
@@ -86,11 +88,11 @@ def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
     """The coordinates that the parts constrain."""
     found = torch.zeros(dim, dtype=torch.bool)
     for part in parts:
-        level = getattr(part, "level", None)
+        level = part.acting if isinstance(part, Chain) else getattr(part, "level", None)
         if isinstance(level, Affine):
-            found |= (level.a != 0).cpu()
+            found |= (level.a != 0).view(-1, dim).any(0).cpu()
         elif isinstance(level, Ellipsoid):
-            found |= (level.which != 0).any(0).cpu()
+            found |= (level.which != 0).view(-1, dim).any(0).cpu()
         else:
             found[:] = True
     return found.nonzero()[:, 0].tolist()
@@ -98,12 +100,14 @@ def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
 
 def _restricted(part: Part, used: Sequence[int]) -> Part:
     """The same part of those coordinates alone."""
-    level = getattr(part, "level", None)
-    if isinstance(level, Affine):
-        return cast(Part, replace(cast(Any, part), level=replace(level, a=level.a[used])))
-    if isinstance(level, Ellipsoid):
-        return cast(Part, replace(cast(Any, part), level=replace(level, which=level.which[:, used])))
-    return part
+    numbers: dict[str, Any] = {}
+    for name in ("level", "ahead"):
+        level = getattr(part, name, None)
+        if isinstance(level, Affine):
+            numbers[name] = replace(level, a=level.a[..., used])
+        elif isinstance(level, Ellipsoid):
+            numbers[name] = replace(level, which=level.which[..., used])
+    return cast(Part, replace(cast(Any, part), **numbers)) if numbers else part
 
 
 def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
@@ -116,12 +120,13 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     sliding = any(isinstance(part, Segments) for part in g.parts)
     around = cast(Any, [part for part in g.parts if sliding and tangible(part)])
     others = [part for part in g.parts if not (sliding and tangible(part))]
-    whole = bool((pins.mask.all(1) == pins.mask.any(1)).all())  # the exact forms move all of a waypoint or nothing of it
     begin = z
-    if (whole or not others) and all(has_exact_form(part) for part in others):
+    if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
         onto += [partial(exact, part, pins=pins) for part in others]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
+        if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
+            return x  # one exact form misses only what is pinned behind what it moves
         if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
             x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
         missed = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
@@ -147,7 +152,7 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
     if not bool(touched.any()):
         return z
     some, held = z[touched], Pins(pins.mask, pins.values[touched])
-    x = some
+    parts, x = [part.take(touched) for part in parts], some
     for _ in range(REFINEMENTS):
         x = nearest_in_planes(some, planes(parts, x, held), held)
     out = z.clone()
@@ -157,10 +162,11 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
 
 def has_exact_form(part: Part) -> bool:
     if isinstance(part, Waypoints):
-        return isinstance(part.level, Affine | Quadric | Ellipsoid)
-    return isinstance(part, Chain) and (
-        isinstance(part.level, Affine) or (isinstance(part.level, Ellipsoid) and part.level.side > 0 and part.level.is_ball)
-    )
+        return isinstance(part.level, Affine | Quadric | Framed | Ellipsoid)
+    if not isinstance(part, Chain):
+        return False
+    level = part.acting
+    return isinstance(level, Affine | Approach) or (isinstance(level, Ellipsoid) and level.side > 0 and level.is_ball)
 
 
 def exact(part: Part, z: Traj, pins: Pins) -> Traj:
@@ -168,7 +174,7 @@ def exact(part: Part, z: Traj, pins: Pins) -> Traj:
     if isinstance(part, Waypoints):
         return pins.paint(nearest(part.level, z))
     assert isinstance(part, Chain)
-    return nearest_on_chain(part, z, pins)
+    return pins.paint(nearest_on_chain(part, z, pins))
 
 
 # several at once, and anything else -----------------------------------------------------------------------------------
@@ -205,7 +211,7 @@ def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: floa
         matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
         x = begin[b : b + 1].double()
         one = Pins(pins.mask, x)
-        g64 = g.to(x)
+        g64 = g.take(torch.tensor([b], device=z.device)).to(x)
         for _ in range(rounds):
             rows, pull, _ = g64.linearise(x)
             jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]
@@ -256,7 +262,8 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
         if isinstance(part, Waypoints):
             each.append(free)
         elif isinstance(part, Chain | Segments):
-            each.append(free[:-1] | free[1:])
+            order = len(part.coefficients) - 1 if isinstance(part, Chain) else 1
+            each.append(free.unfold(0, order + 1, 1).any(1) if len(free) > order else free[:0])
         else:
             each.append(torch.ones(len(part.labels(x.shape[1])), dtype=torch.bool, device=x.device))
     return torch.cat(each)

@@ -10,21 +10,61 @@ from cdiff_cli.config import Strict, load
 from cdiff_cli.errors import CdiffError
 
 Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
 
 
 class NetworkSpec(Strict):
     """Size of the TemporalUnet (networks.py); the defaults are Diffuser's architecture."""
 
+    kind: Literal["unet"] = "unet"
     width: Annotated[int, Field(gt=0, multiple_of=8)] = 32  # the channels are normalised in 8 groups
     multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
     patch: Literal[1, 2, 4, 8, 16] = 1
     octaves: Annotated[int, Field(ge=0, le=10)] = 0
+    conditions: Count = 0
+
+    @property
+    def stride(self) -> int:
+        """What the horizon must divide by."""
+        return self.patch * 2 ** (len(self.multipliers) - 1)
+
+
+class MlpSpec(Strict):
+    """Size of the ResidualMlp (networks.py), for the short windows of control."""
+
+    kind: Literal["mlp"]
+    width: Positive = 256
+    depth: Positive = 3
+    conditions: Count = 0
+
+    @property
+    def stride(self) -> int:
+        return 1
+
+
+class InverseSpec(Strict):
+    """How the inverse dynamics model is trained.
+
+    ahead   waypoints between the two states it is asked about: 1, or more where one input hardly moves the state
+    hidden  coordinates that it is not shown
+    """
+
+    width: Positive = 256
+    steps: Positive = 6000
+    batch: Positive = 512
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    ahead: Positive = 1
+    hidden: tuple[str, ...] = ()
 
 
 class TrainSpec(Strict):
-    """One way to train; the defaults are those of the small recipe."""
+    """One way to train; the defaults are those of the small recipe.
 
-    network: NetworkSpec = NetworkSpec()
+    begin     the recipe whose checkpoint is trained on, None: from the beginning
+    dropout   of conditional planners, share of the windows shown without their label
+    """
+
+    network: NetworkSpec | MlpSpec = NetworkSpec()
     steps: Positive
     batch: Positive = 32
     accumulate: Positive = 1
@@ -36,6 +76,9 @@ class TrainSpec(Strict):
     trips: Annotated[float, Field(ge=0, le=1)] = 0.5
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
+    begin: str | None = None
+    dropout: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    inverse: InverseSpec | None = None
 
 
 class DemonstrationSpec(Strict):
@@ -57,27 +100,44 @@ class Preset(Strict):
     """How to sample.
 
     steps       network calls to respace the schedule to; None: as trained
+    extra_steps further steps with t frozen and no noise; extra_steps_of: the number of a method that has its own
     polish      project the finished plans once more, in float64
     safety      where constraints hold that do not say so themselves
     dynamics    obey the checkpoint's linear dynamics too
+    temperature factor on all noise
+    execute     environment steps a plan is followed, in control
+    warm        in control, share of the diffusion steps done again on the last plan; None: each plan from noise
+    margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
     methods     each method's constants by its name
     """
 
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
     steps: Positive | None = None
-    extra_steps: Annotated[int, Field(ge=0)] = 0
+    extra_steps: Count = 0
+    extra_steps_of: dict[str, Count] = {}
     polish: bool = False
     safety: Literal["waypoints", "segments"] = "waypoints"
     dynamics: bool = False
+    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
+    execute: Positive = 1
+    warm: Annotated[float, Field(gt=0, le=1)] | None = None
+    margin: bool = False
     methods: dict[str, dict[str, Any]] = {}
+
+    def extra_steps_for(self, method: str) -> int:
+        return self.extra_steps_of.get(method, self.extra_steps)
 
 
 class Recipe(Strict):
-    """models/<task>/recipe.yaml"""
+    """models/<task>/recipe.yaml
+
+    frame   limits: the data's limits to [-1, 1]; relative: windows relative to their first state (frames.py), for control
+    """
 
     task: str
     horizon: Positive
     n_steps: Positive
+    frame: Literal["limits", "relative"] = "limits"
     start: dict[str, float] | None = None
     goal: dict[str, float] | None = None
     constraints: str
@@ -89,7 +149,7 @@ class Recipe(Strict):
     @model_validator(mode="after")
     def _horizon_divides(self) -> "Recipe":
         for name, spec in self.train.items():
-            stride = spec.network.patch * 2 ** (len(spec.network.multipliers) - 1)
+            stride = spec.network.stride
             if self.horizon % stride:
                 raise ValueError(f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride")
         return self
@@ -105,6 +165,8 @@ class Recipe(Strict):
 class Card(Strict):
     """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
 
+    inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
+    constraints   hash of the constraints that a conditional planner was trained for; None of the others
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -112,7 +174,7 @@ class Card(Strict):
     recipe: str
     horizon: int
     n_steps: int
-    network: NetworkSpec
+    network: NetworkSpec | MlpSpec
     parameters: int
     steps: int
     seed: int
@@ -127,6 +189,8 @@ class Card(Strict):
     wall_s: float
     data: dict[str, float]
     linear: float | None = None
+    inverse: dict[str, float] | None = None
+    constraints: str | None = None
 
 
 def home() -> Path:

@@ -10,12 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cdiff_cli.baselines import Conditional
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
+from cdiff_cli.conditioning import content_sha256, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
-from cdiff_cli.diffusion import KERNELS, Method, Schedule
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
-from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
+from cdiff_cli.margins import calibrated, tightened
 from cdiff_cli.methods import METHODS, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
@@ -24,6 +27,7 @@ from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
 
 Array = NDArray[np.float64]
+RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
 VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
@@ -41,12 +45,18 @@ class Options:
     goal: str | None = None
     kernel: str | None = None
     steps: int | None = None
+    extra_steps: int | None = None
     settings: tuple[str, ...] = ()
     n: int = 10
     seed: int = 0
     device: str = "auto"
     random: bool = False
     no_dynamics: bool = False
+    execute: int | None = None
+    warm: float | None = None
+    margin: float | None = None
+    action_noise: float = 0.0
+    env: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,19 @@ class Resolved:
     kinds: Sequence[Kind]
     constraints_path: Path
     checkpoint: Checkpoint | None
+    margins: dict[str, float]
+    guided: Denoiser | None = None
+
+    @property
+    def extra_steps(self) -> int:
+        """Frozen steps after the last: those asked for, else the preset's for this method."""
+        asked = self.options.extra_steps
+        return self.preset.extra_steps_for(self.options.method) if asked is None else asked
+
+    @property
+    def calls_a_step(self) -> int:
+        """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
+        return 2 if self.guided is not None and self.settings["weight"] != 1.0 else 1
 
     @property
     def seeds(self) -> list[int]:
@@ -82,21 +105,24 @@ class Resolved:
     def _changed(self) -> bool:
         """Whether an option departs from the preset."""
         asked = self.options
-        return bool(asked.settings or asked.kernel or asked.steps or asked.no_dynamics)
+        changed = (asked.settings, asked.kernel, asked.steps, asked.no_dynamics, asked.execute, asked.warm, asked.action_noise)
+        return any(changed) or asked.extra_steps is not None or asked.margin is not None
 
     def config(self) -> dict[str, Any]:
         """The resolved configuration, for run.yaml."""
         options = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.options).items()}
+        options["env"] = list(self.options.env)
         card = self.checkpoint.card if self.checkpoint else None
         pins = {name: None if s is None else s.tolist() for name, s in self._pins().items()}
         return {
             "options": options | {"settings": list(self.options.settings)},
             "method": {self.options.method: self.settings},
             "kernel": self.kernel,
-            "extra_steps": self.preset.extra_steps,
+            "extra_steps": self.extra_steps,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
+            "margins": self.margins,
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -117,6 +143,8 @@ def resolve(options: Options) -> Resolved:
     task = load_task(options.task)
     if options.n < 1:
         raise CdiffError(f"--n: expected at least 1 plan, found {options.n}")
+    if (options.extra_steps or 0) < 0:
+        raise CdiffError(f"--extra-steps: expected 0 or more, found {options.extra_steps}")
     if options.method not in METHODS:
         make_method(options.method, {})
     recipe = load_recipe(options.task)
@@ -139,10 +167,12 @@ def resolve(options: Options) -> Resolved:
     else:
         where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")
         checkpoint = load_checkpoint(where, task.name, device)
-        denoiser, normaliser = network_denoiser(checkpoint.net), checkpoint.normaliser
+        limit = 1.0 if checkpoint.frame is None else RELATIVE_LIMIT
+        denoiser, normaliser = network_denoiser(checkpoint.net, limit), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
-    kinds, g = load_constraints(path, task.name, task.layout, checkpoint.dynamics if checkpoint else None)
+    fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
+    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable)
     steps = preset.steps if options.steps is None else options.steps
     if steps is not None:
         if not 1 <= steps <= schedule.n_steps:
@@ -157,9 +187,30 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, obeyed, start, goal, device)
+    margins = {part.name: options.margin for part in g.parts} if options.margin is not None else {}
+    if options.margin is None and preset.margin and checkpoint is not None:
+        margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint)
+    conditioned = _guided(method, kinds, path, checkpoint) if isinstance(method, Conditional) else None
+    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
+
+
+def _guided(method: Conditional, kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Denoiser:
+    """The denoiser of the planner that was trained for these constraints."""
+    if checkpoint is None:
+        raise CdiffError("conditional: this task's score is exact, no planner can be trained for its constraints")
+    task = checkpoint.card.task
+    where = shown(home() / "models" / task / f"conditional-{path.stem}.safetensors")
+    advice = f"train it with `cdiff train --task {task} --conditional {path}`"
+    if not where.exists():
+        raise CheckpointError(f"{where}: no conditional planner for these constraints; {advice}")
+    found = load_checkpoint(where, task, next(checkpoint.net.parameters()).device)
+    if found.card.constraints != content_sha256(kinds):
+        raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
+    if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
+        raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")
+    return guided(found.net, method.weight, 1.0 if found.frame is None else RELATIVE_LIMIT)
 
 
 def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None) -> Constraint:

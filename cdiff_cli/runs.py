@@ -8,7 +8,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import yaml
 
 from cdiff_cli.config import Dumper
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.inference import Interval, Test, bootstrap, holm, interval, paired_p
 
 Row = dict[str, Any]
 
@@ -28,6 +29,11 @@ class Column:
     digits: int
     meaning: str
 
+    @property
+    def share(self) -> bool:
+        """Whether each value is 0 or 1, so that the mean is a rate."""
+        return self.meaning.startswith(("share of plans", "share of episodes"))
+
 
 COLUMNS = {
     "distance": Column("distance / m", 2, "sum over waypoints of |p - p_free|, p_free the unconstrained plan of the same noise"),
@@ -39,9 +45,11 @@ COLUMNS = {
     "residual": Column("residual / m", 5, "mean of |p' - p - v' dt|: positions against velocities"),
     "acceleration": Column("acceleration / m/s^2", 1, "largest |v' - v| / dt"),
     "smooth": Column("smooth", 2, "share of plans whose largest jump is at most 1.2 times the data's 99.9 % quantile"),
+    "torn": Column("torn", 2, "share of plans that are not smooth (the trap rate): they jump across what they should go round"),
     "wall": Column("in wall", 2, "share of plans with a waypoint or segment inside a wall"),
     "safe_waypoints": Column("safe at waypoints", 2, "share of plans with no g above 1e-6 at a waypoint"),
     "safe_segments": Column("safe between", 2, "share of plans with no g above 1e-6 at or between the waypoints"),
+    "unsafe_segments": Column("unsafe segments", 1, "number of segments between waypoints on which some g exceeds 1e-6"),
     "feasible": Column("feasible", 2, "share of plans whose every step the fitted dynamics make with inputs within their bounds"),
     "effort": Column("effort", 2, "largest input that a step of the plan asks for, over its bound; above 1 no actuator follows"),
     "polish": Column("polish / m", 5, "largest displacement by the final exact projection"),
@@ -56,12 +64,34 @@ COLUMNS = {
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
+    "plan_violation": Column("plan violation / g", 4, "violation of a plan, mean over those of the episode"),
+    "safe_plans": Column("safe plans", 3, "share of the episode's plans with no g above 1e-6 at a waypoint"),
+    "fell": Column("fell", 2, "share of episodes that the environment ended early"),
+    "diverged": Column("diverged", 2, "share of episodes whose plans or states were no longer finite"),
+    "contacts": Column("contacts", 2, "environment steps in contact with the obstacle"),
+    "saturation": Column("saturation / %", 1, "share of executed inputs that are at their bounds"),
+    "latency_ms": Column("latency / ms", 2, "median wall time of planning at a control step, all episodes at once"),
+    "latency_p95": Column("latency 95 % / ms", 2, "its 95 % quantile"),
     "steps": Column("steps", 0, "environment steps"),
     "success": Column("success", 2, "share of episodes that end within the environment's success radius of the goal"),
     "goal_distance": Column("goal distance / m", 3, "distance to the goal at the end"),
 }
 KEYS = ("task", "constraints", "method", "preset")
-PLAN_TABLE = ("distance", "violation", "worst_waypoint", "worst_segment", "jump", "mean_speed", "calls", "plan_ms", "step_ms")
+PLAN_TABLE = (
+    "distance",
+    "violation",
+    "worst_waypoint",
+    "worst_segment",
+    "unsafe_segments",
+    "torn",
+    "jump",
+    "mean_speed",
+    "calls",
+    "plan_ms",
+    "step_ms",
+)
+COSTS = ("calls", "plan_ms", "step_ms", "overhead")
+"""Of a method or a batch, not of a seed: nothing to test."""
 QUALITY_TABLE = ("wall", "smooth", "jump", "residual", "acceleration", "mean_speed", "success", "goal_distance")
 ROLLOUT_TABLE = ("success", "executed_violation", "executed_worst", "violation_rate", "goal_distance", "reward", "steps")
 SAFETY_TABLE = (
@@ -74,6 +104,21 @@ SAFETY_TABLE = (
     "wall",
     "effort",
     "distance",
+)
+CONTROL_TABLE = (
+    "reward",
+    "violation_rate",
+    "executed_violation",
+    "executed_worst",
+    "safe_executed",
+    "plan_violation",
+    "fell",
+    "contacts",
+    "saturation",
+    "calls",
+    "latency_ms",
+    "latency_p95",
+    "overhead",
 )
 PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
 
@@ -144,24 +189,26 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Cell:
-    """Mean and standard error (sample standard deviation over sqrt(n)) of one metric of one group."""
+    """Mean and standard error (sample standard deviation over sqrt(n)) of one metric of one group; its interval where asked for."""
 
     mean: float
     error: float
     n: int
+    interval: Interval | None = None
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> "Cell":
+    def of(cls, values: Sequence[float], interval: Interval | None = None) -> "Cell":
         n = len(values)
         error = statistics.stdev(values) / math.sqrt(n) if n > 1 else math.nan
-        return cls(statistics.fmean(values), error, n)
+        return cls(statistics.fmean(values), error, n, interval)
 
     def text(self, digits: int) -> str:
-        mean = f"{self.mean:.{digits}f}"
-        mean = mean.lstrip("-") if float(mean) == 0 else mean
-        if self.n < 2 or (self.error == 0 and self.mean != 0):  # one value, or one for the whole batch: times, calls
+        mean = _number(self.mean, digits)
+        if self.n > 1 and (self.error != 0 or self.mean == 0):  # otherwise one value, or one for the whole batch: times, calls
+            mean = f"{mean} ± {self.error:.{digits}f}"
+        if self.interval is None:
             return mean
-        return f"{mean} ± {self.error:.{digits}f}"
+        return f"{mean} [{_number(self.interval[0], digits)}, {_number(self.interval[1], digits)}]"
 
 
 @dataclass(frozen=True)
@@ -173,21 +220,84 @@ class Group:
     cells: dict[str, Cell]
 
 
-def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None) -> list[Group]:
-    """Groups in order of task, constraints, preset and method; one row a seed, the last given wins."""
-    newest: dict[tuple[str, ...], dict[str, Row]] = {}
+def newest(rows: Sequence[Row]) -> dict[tuple[str, ...], dict[str, Row]]:
+    """The rows of each group by seed, in order of task, constraints, preset and method; the last given of a seed wins."""
+    found: dict[tuple[str, ...], dict[str, Row]] = {}
     for row in rows:
-        newest.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = row
+        torn = {"torn": 1.0 - row["smooth"]} if isinstance(row.get("smooth"), float) else {}
+        found.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = row | torn
+    return {
+        key: found[key] for key in sorted(found, key=lambda k: (k[0], k[1], _order(PRESET_ORDER, k[3]), _order(METHOD_ORDER, k[2])))
+    }
+
+
+def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None, intervals: bool = False) -> list[Group]:
+    """The groups of `newest`, summed up; with 95 % intervals where asked for."""
     groups = []
-    for key in sorted(newest, key=lambda k: (k[0], k[1], _order(PRESET_ORDER, k[3]), _order(METHOD_ORDER, k[2]))):
-        mine = list(newest[key].values())
+    for key, by_seed in newest(rows).items():
+        mine = list(by_seed.values())
         names = metrics or [name for name in COLUMNS if any(isinstance(row.get(name), float) for row in mine)]
         values = {name: [row[name] for row in mine if isinstance(row.get(name), float)] for name in names}
-        groups.append(Group(key, len(mine), {name: Cell.of(v) for name, v in values.items() if v}))
+        bounds = {name: interval(v, COLUMNS[name].share) for name, v in values.items() if intervals and name not in COSTS}
+        groups.append(Group(key, len(mine), {name: Cell.of(v, bounds.get(name)) for name, v in values.items() if v}))
     return groups
 
 
-METHOD_ORDER = ("diffuser", "guidance", "conditional", "safediffuser", "projected", "primal-dual", "alm")
+@dataclass(frozen=True)
+class Difference:
+    """One metric of one method against the reference method, paired by seed within the same task, constraints and preset.
+
+    mean       of the differences, method minus reference; interval: 95 %, bootstrap
+    p, holm    two-sided, as tested and corrected for all tests of this metric
+    """
+
+    key: tuple[str, ...]
+    metric: str
+    n: int
+    mean: float
+    interval: Interval | None
+    p: float
+    holm: float
+
+
+def differences(rows: Sequence[Row], reference: str, metrics: Sequence[str], test: Test = "wilcoxon") -> list[Difference]:
+    """Every other method against the reference where both have rows of the same seeds; metrics that nowhere differ are left out."""
+    groups, found = newest(rows), []
+    for name in metrics:
+        family = []
+        for key, mine in groups.items():
+            task, constraints, method, preset = key
+            theirs = groups.get((task, constraints, reference, preset), {})
+            both = [seed for seed in mine if isinstance(mine[seed].get(name), float)]
+            both = [seed for seed in both if isinstance(theirs.get(seed, {}).get(name), float)]
+            d = [mine[seed][name] - theirs[seed][name] for seed in both]
+            if method != reference and d and name not in COSTS:
+                p = paired_p(d, test, COLUMNS[name].share)
+                family.append(Difference(key, name, len(d), statistics.fmean(d), bootstrap(d), p, p))
+        if all(each.mean == 0 and each.p == 1 for each in family):
+            continue
+        corrected = holm([each.p for each in family])
+        found += [replace(each, holm=p) for each, p in zip(family, corrected, strict=True)]
+    return found
+
+
+def _number(value: float, digits: int) -> str:
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text
+
+
+METHOD_ORDER = (
+    "diffuser",
+    "guidance",
+    "conditional",
+    "best-of-k",
+    "final-projection",
+    "terminal",
+    "safediffuser",
+    "projected",
+    "primal-dual",
+    "alm",
+)
 PRESET_ORDER = ("paper", "released", "recommended")
 
 

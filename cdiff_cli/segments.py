@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.constraint import Pins, Segments, Traj, Waypoints
-from cdiff_cli.levels import Affine, Ellipsoid
+from cdiff_cli.levels import Affine, Ellipsoid, dot, each_end
 
 Planes = tuple[Tensor, Tensor]
 """Half-spaces a.x <= b of each waypoint: a [batch, horizon, m, dim], b [batch, horizon, m]."""
@@ -32,12 +32,19 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
             continue
         assert isinstance(level, Ellipsoid)
         n = normals(level, x, pins)
-        a = -(n / level.axes) @ level.which
-        b = -1 - (n / level.axes) @ level.centre
-        zero, never = torch.zeros_like(a[:, :1]), torch.full_like(b[:, :1], NEVER)
-        each.append((torch.cat((zero, a), 1), torch.cat((never, b), 1)))  # of the segment before
-        each.append((torch.cat((a, zero), 1), torch.cat((b, never), 1)))  # of the segment after
+        zero, never = torch.zeros_like(x[:, :1]), torch.full_like(x[:, :1, 0], NEVER)
+        first, last = zip(each_end(level.centre, 1), each_end(level.axes, 1), strict=True)
+        a, b = _tangent(n, level, *last)  # of the segment before
+        each.append((torch.cat((zero, a), 1), torch.cat((never, b), 1)))
+        a, b = _tangent(n, level, *first)  # of the segment after
+        each.append((torch.cat((a, zero), 1), torch.cat((b, never), 1)))
     return torch.stack([a for a, _ in each], 2), torch.stack([b for _, b in each], 2)
+
+
+def _tangent(n: Tensor, level: Ellipsoid, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """The half-spaces n.y >= 1 as a.x <= b, y the level's scaled x."""
+    slope = n / axes
+    return -slope @ level.which, -1 - dot(slope, centre)
 
 
 def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
@@ -53,8 +60,7 @@ def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
     if y.shape[-1] == 1:
         return _one_side(y, pinned)
     first, last = y[:, :-1], y[:, 1:]
-    s = level.worst(x[:, :-1], x[:, 1:])[..., None]
-    near = first + s * (last - first)
+    near = first + level.worst(x)[..., None] * (last - first)
     distance = near.norm(dim=-1)
     n = _unit(near, first)
     inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-4)  # well above the rounding of a safe path

@@ -4,7 +4,7 @@ Environment units and coordinate names only. A further kind comes from another p
 `cdiff.constraints`: a Strict model with `kind`, `name`, `coordinates()` and `compile(layout)`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, Union, cast
@@ -12,141 +12,124 @@ from typing import Annotated, Any, Literal, Protocol, Union, cast
 import torch
 from pydantic import Field, create_model, model_validator
 
+from cdiff_cli.approach import approached
 from cdiff_cli.config import Document, Strict
-from cdiff_cli.constraint import Chain, Constraint, Part, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Part
 from cdiff_cli.dynamics import LinearDynamics, Reachable
 from cdiff_cli.errors import suggestion
-from cdiff_cli.levels import Affine, Ellipsoid, Level, Quadric
+from cdiff_cli.levels import Affine, Ellipsoid, Level
+from cdiff_cli.spec_levels import (
+    Coordinates,
+    Hold,
+    Layout,
+    Linear,
+    Location,
+    Number,
+    PositiveNumber,
+    Quadratic,
+    Safety,
+    Velocity,
+    check_velocity,
+    moves,
+    names_in,
+    observed_or_not,
+    vector,
+)
 
-Number = Annotated[float, Field(strict=True)]
-PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
-Coordinates = Annotated[dict[str, Number], Field(min_length=1)]
-Location = tuple[str | int, ...]
-Layout = Sequence[str]
 DYNAMICS_TOLERANCE = 1e-5  # of a step against the dynamics, environment units: the rounding of float32 plans
-Safety = Annotated[
-    Literal["waypoints", "segments"] | None,
-    Field(description="where it must hold: at waypoints, or all along the straight segments between them; default: the preset's"),
-]
 
 
-class Linear(Strict):
-    """a.x <= b."""
+class LookAhead(Strict):
+    """The barrier looks ahead by `time`: psi = h + time dh/dt, or h of the place that the velocity leads to, h(p + time v)."""
 
-    kind: Literal["linear"]
-    name: str = ""
-    safety: Safety = None
-    a: Annotated[Coordinates, Field(description="coefficient of each coordinate; coordinates left out count 0")]
-    b: Annotated[Number, Field(description="bound, in the units of a.x")]
-
-    @model_validator(mode="after")
-    def _not_zero(self) -> "Linear":
-        if not any(self.a.values()):
-            raise ValueError("all coefficients are 0, so the constraint restricts nothing; give at least one that is not")
-        return self
-
-    def coordinates(self) -> Iterator[tuple[Location, str]]:
-        yield from ((("a", name), name) for name in self.a)
-
-    def level(self, layout: Layout) -> Level:
-        return Affine(_vector(self.a, layout), torch.tensor(self.b, dtype=torch.float64))
-
-    def compile(self, layout: Layout) -> Part:
-        return Waypoints(self.name, self.level(layout))
-
-    def describe(self) -> str:
-        return f"{_sum(self.a)} <= {self.b:g}"
-
-
-class Quadratic(Strict):
-    """Inside or outside a ball (centre, radius), an ellipsoid (centre, semi_axes), or x.P x + q.x = r.
-
-    form distance: the signed distance to the ball's surface (for an ellipsoid a lower bound of it), metres.
-    form squared:  radius^2 - |x - centre|^2 and the like, square metres.
-    """
-
-    kind: Literal["quadratic"]
-    name: str = ""
-    safety: Safety = None
-    side: Literal["outside", "inside"]
-    centre: Coordinates | None = None
-    radius: PositiveNumber | None = None
-    semi_axes: Annotated[dict[str, PositiveNumber], Field(min_length=1)] | None = None
-    P: Annotated[dict[str, Coordinates], Field(min_length=1)] | None = None
-    q: Coordinates | None = None
-    r: Number | None = None
-    form: Literal["distance", "squared"] = "distance"
-
-    @model_validator(mode="after")
-    def _one_shape(self) -> "Quadratic":
-        general = self.P is not None or self.q is not None or self.r is not None
-        round_ = self.centre is not None or self.radius is not None or self.semi_axes is not None
-        if general and round_:
-            raise ValueError("found both a centre and P, q, r; give either centre and radius (or semi_axes), or P, q, r")
-        if general and (self.P is None or self.r is None):
-            raise ValueError("P and r belong together (q is optional): x.P x + q.x <= r inside, >= r outside")
-        if not general and (self.centre is None or (self.radius is None) == (self.semi_axes is None)):
-            raise ValueError("expected a centre and either a radius or semi_axes (or P, q, r)")
-        if self.semi_axes is not None and set(self.semi_axes) != set(self.centre or {}):
-            raise ValueError("semi_axes must name the same coordinates as centre")
-        if general and "form" in self.model_fields_set and self.form == "distance":
-            raise ValueError("P, q, r has no distance form; leave `form` out")
-        return self
-
-    def coordinates(self) -> Iterator[tuple[Location, str]]:
-        for field in ("centre", "semi_axes", "P", "q"):
-            for name in getattr(self, field) or {}:
-                yield (field, name), name
-        for row, columns in (self.P or {}).items():
-            yield from ((("P", row, name), name) for name in columns)
-
-    def level(self, layout: Layout) -> Level:
-        sign = -1.0 if self.side == "outside" else 1.0
-        if self.P is not None:
-            P = torch.stack([_vector(self.P.get(row, {}), layout) for row in layout])
-            r = torch.tensor(self.r, dtype=torch.float64)
-            return Quadric(sign * (P + P.T) / 2, sign * _vector(self.q or {}, layout), sign * r)
-        assert self.centre is not None
-        names = [name for name in layout if name in self.centre]
-        axes = torch.tensor([self.semi_axes[n] if self.semi_axes else self.radius for n in names], dtype=torch.float64)
-        centre = torch.tensor([self.centre[name] for name in names], dtype=torch.float64)
-        which = torch.stack([_vector({name: 1.0}, layout) for name in names])
-        ball = Ellipsoid(which, centre, axes, axes.min(), -int(sign))
-        if self.form == "distance":
-            return ball
-        level, square = ball.quadric(), axes.min() ** 2
-        return Quadric(level.P * square, level.q * square, level.r * square)
-
-    def compile(self, layout: Layout) -> Part:
-        return Waypoints(self.name, self.level(layout))
-
-    def describe(self) -> str:
-        if self.P is not None:
-            square = " + ".join(f"{v:g} {a} {b}" for a, row in self.P.items() for b, v in row.items())
-            linear = f" + {_sum(self.q)}" if self.q else ""
-            return f"{square}{linear} {'>=' if self.side == 'outside' else '<='} {self.r:g}"
-        centre = ", ".join(f"{name} = {value:g}" for name, value in (self.centre or {}).items())
-        size = f"radius {self.radius:g}" if self.radius else "semi-axes " + _sum(self.semi_axes or {}).replace(" + ", ", ")
-        return f"{self.side} the {'ball' if self.radius else 'ellipsoid'} at {centre}, {size} ({self.form})"
+    time: Annotated[PositiveNumber, Field(description="seconds")]
+    form: Annotated[Literal["rate", "place"], Field(description="rate: h + time dh/dt; place: h(p + time v)")] = "rate"
+    velocity: Annotated[dict[str, str], Field(min_length=1, description="the coordinate that is the rate of each coordinate")]
 
 
 class Dcbf(Strict):
-    """Discrete control barrier function along the plan: h(x') >= (1 - alpha) h(x), h >= 0 safe, h = -g of the barrier."""
+    """Discrete control barrier function along the plan: h(x') >= (1 - alpha) h(x), h >= 0 safe, h = -g of the barrier.
+
+    A plan that begins with h >= 0 keeps h >= 0 at every waypoint; one that begins with h < 0 loses at least the share alpha of
+    what is missing in each step. An executed step keeps the promise only where the input can change h at the next waypoint:
+    where it moves velocities and h asks for positions (relative degree 2), one of two options makes it reach:
+
+    order: 2      psi(x) = h(x') - (1 - alpha) h(x), psi(x') >= (1 - alpha2) psi(x): a high-order barrier (Xiong et al., 2022, IEEE
+                  Transactions on Cybernetics). Keeps h >= 0 where the plan begins with h >= 0 and psi >= 0. Of a plan that begins
+                  with psi < 0 it asks that psi recovers; h may fall below 0 meanwhile.
+    look_ahead    another barrier in the place of h, which an input changes at once; an observed velocity leads the obstacle on too:
+        form: rate    psi = h + time dh/dt. While psi >= 0, h(t) >= h(0) e^(-t / time): what starts safe stays safe (a high-order
+                      barrier; Xiao and Belta, 2019), in continuous time and for a plan executed exactly
+        form: place   h(p + time v), never below psi. Keeps that >= 0; p itself is an average of the places it was led to
+                      (p' = p + dt v, dt <= time): it stays within a convex safe set, and round an obstacle may cut the corner
+    """
 
     kind: Literal["dcbf"]
     name: str = ""
     safety: Safety = None
     alpha: Annotated[float, Field(strict=True, gt=0, le=1, description="share of h that a step may use up")]
+    order: Annotated[Literal[1, 2], Field(description="2: high-order, for barriers of positions under inputs that are forces")] = 1
+    alpha2: Annotated[
+        float | None, Field(strict=True, gt=0, le=1, description="of order 2, share of psi that a step may use up; default: alpha")
+    ] = None
+    look_ahead: LookAhead | None = None
     barrier: Annotated[Linear | Quadratic, Field(discriminator="kind")]
+    velocity: Velocity = None
+    hold: Hold = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Dcbf":
+        if self.alpha2 is not None and self.order == 1:
+            raise ValueError("`alpha2` belongs to `order: 2`; add that, or leave it out")
+        if self.barrier.velocity is not None or self.barrier.hold is not None:
+            raise ValueError("`velocity` and `hold` of a barrier stand beside it, not in it; move them out of `barrier`")
+        check_velocity(self.velocity, self.barrier)
+        if self.look_ahead is not None:
+            if isinstance(self.barrier, Quadratic) and (self.barrier.P is not None or self.barrier.form != "distance"):
+                raise ValueError("`look_ahead` takes a linear barrier or a quadratic one of `form: distance`")
+            round_ = isinstance(self.barrier, Quadratic) and (self.barrier.radius is None or self.barrier.side == "inside")
+            if round_ and self.look_ahead.form == "rate":
+                raise ValueError("`look_ahead` of `form: rate` takes a linear barrier or the outside of a ball; try `form: place`")
+            rates, own = self.look_ahead.velocity, dict.fromkeys(name for _, name in self.barrier.coordinates())
+            if set(rates) != set(own) or len(set(rates.values())) < len(rates) or set(rates.values()) & set(own):
+                raise ValueError(f"`look_ahead.velocity` must name a rate of its own for each of {', '.join(own)}")
+        return self
 
     def coordinates(self) -> Iterator[tuple[Location, str]]:
         yield from ((("barrier", *location), name) for location, name in self.barrier.coordinates())
+        yield from ((("velocity", name), name) for name in self.velocity or {})
+        for name, rate in (self.look_ahead.velocity if self.look_ahead else {}).items():
+            yield from ((("look_ahead", "velocity", name), each) for each in (name, rate))
+
+    def observes(self) -> Iterator[tuple[Location, str]]:
+        """Where the name of an observed quantity stands."""
+        yield from ((("barrier", *location), name) for location, name in self.barrier.observes())
+        yield from names_in({"velocity": self.velocity})
 
     def compile(self, layout: Layout) -> Part:
-        return Chain(self.name, self.barrier.level(layout), self.alpha)
+        return observed_or_not(self.name, self.barrier, self.velocity, self.hold, layout, self._chain)
+
+    def _chain(self, at: Callable[[float], Level], layout: Layout) -> Part:
+        alpha2 = None if self.order == 1 else self.alpha2 or self.alpha
+        if self.look_ahead is None:
+            return Chain(self.name, at(0.0), self.alpha, alpha2)
+        led = torch.eye(len(layout), dtype=torch.float64)
+        for name, rate in self.look_ahead.velocity.items():
+            led[layout.index(name), layout.index(rate)] = self.look_ahead.time
+        level, later = at(0.0), cast(Affine | Ellipsoid, at(self.look_ahead.time))
+        if isinstance(later, Affine) or self.look_ahead.form == "place":
+            return Chain(self.name, level, self.alpha, alpha2, later.through(led))
+        ahead = approached(cast(Ellipsoid, level), later.centre, led, self.look_ahead.time)
+        return Chain(self.name, level, self.alpha, alpha2, ahead)
 
     def describe(self) -> str:
-        return f"h' >= {1 - self.alpha:g} h, h >= 0 where {self.barrier.describe()}"
+        rule = f"h' >= {1 - self.alpha:g} h"
+        if self.order == 2:
+            rule = f"psi' >= {1 - (self.alpha2 or self.alpha):g} psi, psi = h' - {1 - self.alpha:g} h"
+        lead, ahead = self.look_ahead, ""
+        if lead is not None:
+            ahead = f", h + {lead.time:g} s dh/dt for h" if lead.form == "rate" else f" in {lead.time:g} s at the present velocity"
+        return f"{rule}, h >= 0 where {self.barrier.describe()}{ahead}{moves(self.velocity, self.hold)}"
 
 
 class Dynamics(Strict):
@@ -204,9 +187,9 @@ class Dynamics(Strict):
         assert self.inputs is not None
         low, high = torch.tensor(list(self.inputs.values()), dtype=torch.float64).T
         dynamics = LinearDynamics(
-            A=torch.stack([_vector(self.A.get(row, {}), layout) for row in layout]),
-            B=torch.stack([_vector(self.B.get(row, {}), list(self.inputs)) for row in layout]),
-            c=_vector(self.c or {}, layout),
+            A=torch.stack([vector(self.A.get(row, {}), layout) for row in layout]),
+            B=torch.stack([vector(self.B.get(row, {}), list(self.inputs)) for row in layout]),
+            c=vector(self.c or {}, layout),
             low=low,
             high=high,
         )
@@ -246,11 +229,12 @@ def file_model() -> type[Strict]:
 
 
 def load_constraints(
-    path: Path, task: str, layout: Layout, dynamics: LinearDynamics | None = None
+    path: Path, task: str, layout: Layout, dynamics: LinearDynamics | None = None, observable: Sequence[str] = ()
 ) -> tuple[list[Kind], Constraint]:
     """The kinds of a constraint file and the g(x) <= 0 they compile into, environment units; raises SpecError.
 
-    dynamics   what `fit: demonstrations` stands for; None where there are none
+    dynamics     what `fit: demonstrations` stands for; None where there are none
+    observable   names of the quantities that the task lets constraints observe
     """
     document = Document(path)
     model = cast(Any, document.read(file_model()))
@@ -265,6 +249,9 @@ def load_constraints(
                 raise document.error(
                     ("constraints", i, *location), f'no coordinate "{name}" in {task}{suggestion(name, layout)}; it has {known}'
                 )
+        for location, name in spec.observes() if hasattr(spec, "observes") else ():
+            if name not in observable:
+                raise document.error(("constraints", i, *location), _not_observable(name, task, observable))
         named = spec if spec.name else spec.model_copy(update={"name": f"{spec.kind}-{i}"})
         if named.name in seen:
             raise document.error(("constraints", i, "name"), f'the name "{named.name}" stands twice; names tell rows apart')
@@ -281,6 +268,13 @@ def load_constraints(
     return parts, Constraint(tuple(spec.compile(layout) for spec in parts))
 
 
+def _not_observable(name: str, task: str, observable: Sequence[str]) -> str:
+    if not observable:
+        return f'expected a valid number, found "{name}"; {task} has no quantities to observe'
+    known = ", ".join(observable)
+    return f'expected a valid number or an observed quantity, found "{name}"{suggestion(name, observable)}; {task} offers {known}'
+
+
 def enforced(kinds: Sequence[Kind], g: Constraint, safety: str) -> Constraint:
     """What sampling obeys: the parts that are to hold on segments (by their own word, else the preset's) taken so."""
     wanted = [getattr(kind, "safety", None) or safety for kind in kinds]
@@ -291,11 +285,3 @@ def enforced(kinds: Sequence[Kind], g: Constraint, safety: str) -> Constraint:
 def json_schema() -> dict[str, Any]:
     """JSON schema of a constraint file, for editors."""
     return file_model().model_json_schema()
-
-
-def _vector(values: dict[str, float], layout: Layout) -> torch.Tensor:
-    return torch.tensor([values.get(name, 0.0) for name in layout], dtype=torch.float64)
-
-
-def _sum(values: dict[str, float]) -> str:
-    return " + ".join(f"{value:g} {name}" for name, value in values.items())

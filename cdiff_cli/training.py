@@ -7,23 +7,29 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cdiff_cli.checkpoint import Checkpoint, build, read_safetensors, save_checkpoint, write_safetensors
+from cdiff_cli.checkpoint import Checkpoint, Network, build, load_checkpoint, read_safetensors, save_checkpoint, write_safetensors
+from cdiff_cli.conditioning import LABELS, Condition, drop
 from cdiff_cli.data import Array, Normaliser, Progress, Windows, demonstrations, digest, load_dataset, load_inputs
 from cdiff_cli.diffusion import Schedule, Weighing, training_loss
 from cdiff_cli.dynamics import LinearDynamics, fit
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
-from cdiff_cli.networks import TemporalUnet
-from cdiff_cli.recipe import Recipe, TrainSpec, shown
-from cdiff_cli.tasks import Task
+from cdiff_cli.frames import Frame
+from cdiff_cli.inverse import fit_inverse
+from cdiff_cli.recipe import Recipe, TrainSpec, home, shown
+from cdiff_cli.tasks import ControlTask, Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
 LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
+
+
+Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor | None]]
+"""(how many, generator) -> windows and, of a conditional planner, their labels."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,7 @@ def train(
     work: Path,
     resume: bool = False,
     dataset: str | None = None,
+    condition: Condition | None = None,
     save_every: int = 500,
     on_data: Progress | None = None,
     on_step: Callable[[Status], None] | None = None,
@@ -65,30 +72,32 @@ def train(
 
     work holds state.safetensors, written every save_every steps and on interruption; resume goes on from there and, on one
     CPU with as many threads, ends with the same bits as an uninterrupted run.
+
+    condition   constraints to condition the planner on; the recipe's network must have room for their labels
     """
     if not recipe.train:
         raise CdiffError(f"{task.name} needs no training: its score is exact")
     if size not in recipe.train:
         raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
     spec = recipe.train[size]
+    if spec.network.conditions != (LABELS if condition else 0):
+        wanted = f"conditions: {LABELS} in its network" if condition else "--conditional FILE"
+        raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or add it')
     asked = recipe.demonstrations
     episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
-    states = np.concatenate(episodes)
-    normaliser = Normaliser.fit(states, task.layout, task.shared_scale)
-    windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
-    if task.velocities:
-        columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
-        windows = windows.favour_trips(spec.trips, *columns)
+    data = Data.of(task, recipe, spec, episodes, condition)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
         state.load(work / "state.safetensors")
-    schedule, pinned = Schedule.cosine(recipe.n_steps), end_pins(recipe.horizon, len(task.layout)).to(device)
+    elif spec.begin:
+        state.begin(load_checkpoint(shown(home() / "models" / task.name / f"{spec.begin}.safetensors"), task.name, device))
+    schedule, pinned = Schedule.cosine(recipe.n_steps), data.pinned.to(device)
     work.mkdir(parents=True, exist_ok=True)
     began = time.monotonic() - state.wall_s
     try:
         while state.step < spec.steps:
-            loss = state.advance(windows, schedule, pinned)
+            loss = state.advance(data.draw, schedule, pinned)
             if on_step:
                 on_step(Status(state.step, spec.steps, loss))
             state.wall_s = time.monotonic() - began
@@ -100,10 +109,15 @@ def train(
         raise
     state.save(work / "state.safetensors")
     source = dataset or f"cdiff/{task.name}-v0"
-    dynamics = fit_dynamics(episodes, load_inputs(source))
+    inputs = load_inputs(source)
+    dynamics = fit_dynamics(episodes, inputs)
+    inverse, explained = None, None
+    if spec.inverse is not None:
+        hidden = torch.tensor([name in spec.inverse.hidden for name in task.layout])
+        inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, hidden, seed)
     card = {
         "task": task.name,
-        "recipe": size,
+        "recipe": size if condition is None else f"conditional-{condition.name}",
         "horizon": recipe.horizon,
         "n_steps": recipe.n_steps,
         "network": spec.network.model_dump(mode="json"),
@@ -120,11 +134,12 @@ def train(
         "wall_s": round(state.wall_s, 1),
         "data": data_statistics(task, episodes, recipe.horizon),
         "linear": None if dynamics is None else round(dynamics[1], 6),
+        "inverse": explained,
+        "constraints": condition.sha256 if condition else None,
     }
-    sample = windows[torch.linspace(0, len(windows.starts) - 1, SAMPLES).long()].double()
-    tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()}
-    tensors |= {"normaliser.centre": normaliser.centre, "normaliser.scale": normaliser.scale}
-    tensors |= {"demonstrations": normaliser.decode(sample).float()}
+    tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()} | data.tensors()
+    if inverse is not None:
+        tensors |= {f"inverse.{name}": value.contiguous() for name, value in inverse.state_dict().items()}
     if dynamics is not None and dynamics[1] >= LINEAR:
         tensors |= {f"dynamics.{name}": value for name, value in vars(dynamics[0]).items()}
     return save_checkpoint(work / "model.safetensors", tensors, card)
@@ -146,12 +161,62 @@ def end_pins(horizon: int, dim: int) -> Tensor:
     return pinned
 
 
+@dataclass(frozen=True)
+class Data:
+    """The windows that a network is trained on, in its own coordinates.
+
+    frame    of relative windows; None where the data's limits are the coordinates
+    pinned   coordinates given clean, in training as in sampling   [horizon, dim]
+    """
+
+    windows: Windows
+    normaliser: Normaliser
+    frame: Frame | None
+    pinned: Tensor
+    condition: Condition | None
+    dropout: float
+
+    @classmethod
+    def of(
+        cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array], condition: Condition | None = None
+    ) -> "Data":
+        pinned = end_pins(recipe.horizon, len(task.layout))
+        if recipe.frame == "relative":
+            windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
+            frame = Frame.fit(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
+            pinned[-1] = False
+            return cls(windows, frame.state, frame, pinned, condition, spec.dropout)
+        normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)
+        windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
+        if task.velocities:
+            columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
+            windows = windows.favour_trips(spec.trips, *columns)
+        return cls(windows, normaliser, None, pinned, condition, spec.dropout)
+
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """n windows and, of a conditional planner, their labels."""
+        x, label = self.windows.draw(n, generator), None
+        if self.condition is not None:
+            states = x if self.frame is not None else self.normaliser.decode(x.double())
+            label = drop(self.condition.label(states), self.dropout, generator)
+        return x if self.frame is None else self.frame.encode(x), label
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps of them."""
+        sample = self.windows[torch.linspace(0, len(self.windows.starts) - 1, SAMPLES).long()].double()
+        kept = {"normaliser.centre": self.normaliser.centre, "normaliser.scale": self.normaliser.scale}
+        if self.frame is None:
+            return kept | {"demonstrations": self.normaliser.decode(sample).float()}
+        kept |= {f"frame.{name}": getattr(self.frame, name).contiguous() for name in ("seen", "mean", "gain", "scale")}
+        return kept | {"demonstrations": sample.float()}
+
+
 @dataclass
 class _Fit:
     """All that changes in training; exactly what is saved."""
 
-    net: TemporalUnet
-    ema: TemporalUnet
+    net: Network
+    ema: Network
     optimiser: torch.optim.Adam
     generator: torch.Generator
     spec: TrainSpec
@@ -171,14 +236,23 @@ class _Fit:
     def start(cls, dim: int, recipe: Recipe, spec: TrainSpec, seed: int, device: torch.device, data_sha256: str) -> "_Fit":
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # weight initialisation draws from the global generator; fork_rng restores it
-            net, ema = (build(dim, spec.network) for _ in range(2))
+            net, ema = (build(dim, recipe.horizon, spec.network) for _ in range(2))
         ema.load_state_dict(net.state_dict())
         net, ema = net.to(device), ema.to(device).requires_grad_(False)
         optimiser = torch.optim.Adam(net.parameters(), spec.learning_rate)
         generator = torch.Generator().manual_seed(seed)
         return cls(net, ema, optimiser, generator, spec, recipe.horizon, recipe.n_steps, device, seed, data_sha256)
 
-    def advance(self, windows: Windows, schedule: Schedule, pinned: Tensor) -> float:
+    def begin(self, base: Checkpoint) -> None:
+        """Go on from the weights of a finished checkpoint of the same data and, but for the labels, the same network."""
+        if base.card.data_sha256 != self.data_sha256:
+            raise CheckpointError(f"{base.path}: trained on other demonstrations; train it again, then this one")
+        if base.card.network.model_copy(update={"conditions": self.spec.network.conditions}) != self.spec.network:
+            raise CheckpointError(f"{base.path}: its network is not the one of this recipe, which begins from it; mend recipe.yaml")
+        for net in (self.net, self.ema):
+            net.load_state_dict(net.state_dict() | base.net.state_dict())
+
+    def advance(self, draw: Draw, schedule: Schedule, pinned: Tensor) -> float:
         """One optimiser step; returns the loss."""
         spec, loss_value, mse_value = self.spec, 0.0, 0.0
         weighing = Weighing(spec.smoothness, spec.emphasis)
@@ -187,8 +261,9 @@ class _Fit:
         self.optimiser.zero_grad()
         self.drawn_from = self.generator.get_state()
         for _ in range(spec.accumulate):
-            x0 = windows.draw(spec.batch, self.generator).to(self.device)
-            loss, mse = training_loss(self.net, schedule, x0, pinned, weighing, self.generator, spec.bf16)
+            x0, label = draw(spec.batch, self.generator)
+            x0, label = x0.to(self.device), None if label is None else label.to(self.device)
+            loss, mse = training_loss(self.net, schedule, x0, pinned, weighing, self.generator, spec.bf16, label)
             (loss / spec.accumulate).backward()  # type: ignore[no-untyped-call]
             loss_value, mse_value = loss_value + loss.item() / spec.accumulate, mse_value + mse.item() / spec.accumulate
         if not math.isfinite(loss_value):
@@ -259,6 +334,8 @@ def _average(old: float, new: float) -> float:
 
 def data_statistics(task: Task, episodes: list[Any], horizon: int) -> dict[str, float]:
     """What plans are held against: jumps between waypoints, accelerations, mean speeds over one horizon."""
+    if not task.positions:
+        return {}
     at = [task.layout.index(name) for name in task.positions]
     jump = np.concatenate([np.linalg.norm(np.diff(e[:, at], axis=0), axis=1) for e in episodes])
     facts = {"jump_q999": np.quantile(jump, 0.999), "jump_max": jump.max()}

@@ -308,8 +308,9 @@ def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
     runs = [Run("diffuser", Unconstrained(), Preset())]
     for label, preset in load_recipe(task).presets.items():
         for name in METHODS:
-            if name != "diffuser":
-                runs.append(Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), preset))
+            if name not in ("diffuser", "conditional"):  # the one is there, the other needs training
+                own = preset.model_copy(update={"extra_steps": preset.extra_steps_for(name)})
+                runs.append(Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), own))
     return runs
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import qpsolvers
 import torch
+from scipy.optimize import nnls
 
-from cdiff_cli.constraint import Chain, Constraint, Opaque, Pins, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Pins, Waypoints
 from cdiff_cli.diffusion import Step
 from cdiff_cli.errors import SpecError
 from cdiff_cli.levels import Affine, Ellipsoid, Quadric
+from cdiff_cli.opaque import Opaque
 from cdiff_cli.projection import project
 from cdiff_cli.spec import load_constraints
 
@@ -109,6 +111,15 @@ def qp_project(A, b, z, fixed=None):
     )
     assert x is not None
     return x
+
+
+def least_distance(A, b, z):
+    """min |x - z|^2 s.t. A x <= b, by non-negative least squares (Lawson and Hanson, 1974, chapter 23): exact in sharp corners,
+    where ProxQP may find nothing."""
+    matrix = np.vstack((-A.T, A @ z - b))
+    u, _ = nnls(matrix, np.append(np.zeros(len(z)), 1.0))
+    r = matrix @ u - np.append(np.zeros(len(z)), 1.0)
+    return z - r[:-1] / r[-1]
 
 
 def dense_jacobian(g, x):

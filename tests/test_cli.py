@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cdiff_cli.cli import app
 from cdiff_cli.recipe import Recipe, home, load_recipe
-from cdiff_cli.runs import COLUMNS, read_rows
+from cdiff_cli.runs import COLUMNS, METHOD_ORDER, read_rows
 
 ROOT = Path(__file__).parent.parent
 
@@ -104,11 +104,23 @@ def test_json_is_one_object(tmp_path):
     assert summary[0]["distance"]["mean"] == 0.0
 
 
-@pytest.mark.parametrize("method", ["projected", "primal-dual"])
+@pytest.mark.parametrize("method", sorted(set(METHOD_ORDER) - {"alm", "diffuser"}))
 @pytest.mark.parametrize("preset", ["paper", "released", "recommended"])
 def test_every_method_and_preset_plans(method, preset, tmp_path):
-    result = cdiff("plan", "--method", method, "--preset", preset, "--n", 1, "--json", "--runs", tmp_path)
+    steps = () if method in ("projected", "primal-dual") else ("--steps", 8)
+    result = cdiff("plan", "--method", method, "--preset", preset, *steps, "--n", 1, "--json", "--runs", tmp_path)
     assert json.loads(result.stdout)["summary"][0]["violation"]["mean"] < 20
+
+
+def test_extra_steps_can_be_asked_for_and_mark_the_preset_as_changed(tmp_path):
+    words = ("--method", "safediffuser", "--preset", "paper", "--extra-steps", 5, "--n", 1, "--json", "--runs", tmp_path)
+    summary = json.loads(cdiff("plan", *words).stdout)["summary"][0]
+    assert (summary["calls"]["mean"], summary["preset"]) == (69, "paper*")
+
+
+def test_each_method_of_the_released_preset_takes_its_own_extra_steps():
+    preset = load_recipe("maze2d-umaze").presets["released"]
+    assert [preset.extra_steps_for(name) for name in ("alm", "safediffuser", "diffuser")] == [100, 50, 0]
 
 
 @pytest.mark.parametrize("kernel", ["ddim", "dpm++2m"])
@@ -239,6 +251,18 @@ OPTIONS = {
     "start not numbers": (["--start", "a,b"], ["expected a number for x"]),
     "start too short": (["--start", "1"], ["--start: y missing"]),
     "no plans": (["--n", "0"], ["at least 1"]),
+    "negative extra steps": (["--extra-steps", "-1"], ["--extra-steps: expected 0 or more, found -1"]),
+    "no planner for the constraints": (
+        ["--method", "conditional", "--constraints", "constraints/maze2d-umaze-disc.yaml"],
+        [
+            "no conditional planner for these constraints",
+            "cdiff train --task maze2d-umaze --conditional constraints/",
+        ],
+    ),
+    "unknown variant": (
+        ["--method", "safediffuser", "--set", "variant=rose"],
+        ["safediffuser.variant: expected one of ros, res, tvs"],
+    ),
     "unknown kernel": (["--kernel", "dpm+2m"], ['no kernel "dpm+2m"', 'did you mean "dpm++2m"']),
     "too many steps": (["--steps", "65"], ["expected 1 to 64"]),
     "missing checkpoint": (["--checkpoint", "none.safetensors"], ["no such checkpoint", "cdiff train"]),
@@ -282,6 +306,11 @@ def test_compare_without_runs_says_what_to_do(tmp_path):
 def test_gaussian2d_cannot_be_trained_or_rolled_out(tmp_path):
     assert "needs no training" in cdiff("train", "--task", "gaussian2d", "--runs", tmp_path, code=2).stderr
     assert "no environment" in cdiff("rollout", "--task", "gaussian2d", "--runs", tmp_path, code=2).stderr
+
+
+def test_help_names_every_method():
+    shown = " ".join(cdiff("plan", "--help").stdout.replace("│", " ").split())
+    assert ", ".join(METHOD_ORDER) in shown
 
 
 def test_help_names_every_command_and_imports_no_torch():

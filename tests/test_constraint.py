@@ -156,7 +156,7 @@ def test_tighten_allows_exactly_where_g_is_at_most_minus_the_margin(kind, seed, 
 def test_segment_max_bounds_every_point_of_the_segment_and_is_attained(name, seed):
     level = LEVELS[name]
     x0, x1 = normal(seed, 6, 2, scale=1.5), normal(seed + 1, 6, 2, scale=1.5)
-    bound = segment_max(level, x0, x1)
+    bound = segment_max(level, torch.stack((x0, x1), 1))[:, 0]
     best, width = torch.full((6,), 0.5, dtype=F64), 0.5
     for _ in range(4):  # look closer around the largest value so far: points 5e-9 apart in the end
         s = (best + width * torch.linspace(-1, 1, 201, dtype=F64)[:, None]).clamp(0, 1)

@@ -221,7 +221,7 @@ def test_alm_penalty_on_clean_stops_growing_at_one():
 
 
 def test_make_method_builds_each_of_them_with_its_defaults():
-    assert [make_method(name, {}) for name in METHODS] == [Unconstrained(), Projected(), PrimalDual(), AugmentedLagrangian()]
+    assert {name: make_method(name, {}) for name in METHODS} == {name: kind() for name, kind in METHODS.items()}
 
 
 def test_make_method_reads_numbers_written_as_strings():

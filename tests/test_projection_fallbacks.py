@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from cdiff_cli.constraint import Chain, Constraint, Opaque, Waypoints, stack
+from cdiff_cli.constraint import Chain, Constraint, Waypoints, stack
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Quadric
+from cdiff_cli.opaque import Opaque
 from cdiff_cli.projection import project
 from tests.problems import (
     F64,

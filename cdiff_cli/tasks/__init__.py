@@ -12,6 +12,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
     "maze2d-large": "cdiff_cli.tasks.maze2d:LARGE",
+    "ball-run": "cdiff_cli.tasks.ball_run:BALL_RUN",
     "hopper": "cdiff_cli.tasks.locomotion:HOPPER",
     "swimmer": "cdiff_cli.tasks.locomotion:SWIMMER",
     "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
@@ -62,6 +63,34 @@ class Task(Protocol):
     def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]: ...
     def walls(self) -> NDArray[np.float64]:
         """Solid boxes (x_min, y_min, x_max, y_max) in the plane of the positions [n, 4]."""
+        ...
+
+
+class ControlTask(Task, Protocol):
+    """A task that is replanned at every environment step: what control.py asks of it besides."""
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        ...
+
+    @property
+    def invariant(self) -> tuple[str, ...]:
+        """Coordinates that nothing depends on; networks are not shown them."""
+        ...
+
+    @property
+    def max_steps(self) -> int:
+        """Environment steps of an episode."""
+        ...
+
+    @property
+    def observable(self) -> tuple[str, ...]:
+        """Names of the observed quantities that constraints may use."""
+        ...
+
+    def observed(self, env: Any) -> dict[str, float]:
+        """Their present values."""
         ...
 
 

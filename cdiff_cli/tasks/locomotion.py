@@ -4,6 +4,7 @@ A state is the environment's observation: joint positions without x, then all ve
 """
 
 import json
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -76,6 +77,9 @@ class Locomotion:
             warnings.simplefilter("ignore")  # their import tells of other environments' versions
             import gymnasium
 
+            if render:
+                os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a display
+                options = {"width": 320, "height": 240} | options
             mode = "rgb_array" if render else None
             return gymnasium.make(self.env_id, render_mode=mode, max_episode_steps=self.max_steps, **options)
 

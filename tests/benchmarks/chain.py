@@ -20,7 +20,7 @@ from rich.table import Table
 from scipy import sparse
 from timing import milliseconds
 
-from cdiff_cli.closed_forms import nearest_chain, pool_violators
+from cdiff_cli.chains import nearest_chain, pool_violators
 
 INTERIOR_POINT = {"cvxopt", "kvxopt", "qpax", "qtqp", "ecos", "clarabel"}
 DATA = ("noise", "walk", "smooth")

@@ -22,9 +22,8 @@ arguments = parser.parse_args()
 print(f"{arguments.task}, batch {arguments.n}, median of {arguments.repeats}")
 print(f"{'preset':12} {'method':12} {'network / ms':>14} {'outside / ms':>14} {'share / %':>10}")
 for preset in ("paper", "released", "recommended"):
-    for method in METHODS:
+    for method in (name for name in METHODS if name != "conditional"):  # a network of its own
         resolved = resolve(Options(task=arguments.task, method=method, preset=preset, n=arguments.n))
-        extra = 0 if method == "diffuser" else resolved.preset.extra_steps
         measured = []
         for _ in range(arguments.repeats + 1):
             plans = plan(
@@ -32,7 +31,7 @@ for preset in ("paper", "released", "recommended"):
                 resolved.method,
                 resolved.seeds,
                 kernel=resolved.kernel,
-                extra_steps=extra,
+                extra_steps=resolved.extra_steps,
                 polish=resolved.preset.polish,
             )
             outside = plans.total_s - plans.network_s

@@ -1,0 +1,93 @@
+"""What the paper's methods are compared with, besides SafeDiffuser: each a few lines on the seams of methods.py."""
+
+from dataclasses import dataclass
+
+import torch
+
+from cdiff_cli.constraint import Constraint, Traj
+from cdiff_cli.diffusion import Step
+from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, split
+from cdiff_cli.projection import ADMM_ROUNDS, project_from
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """x_{t-1} = reverse(x0) - weight sum dg(x_t): a push of constant weight along every row's gradient, violated or not.
+
+    The released maze code calls it conditional; the paper's text means `conditional`, trained. Dynamics are left to the polish.
+
+    weight   5.5e-3 as released
+    """
+
+    weight: float = 5.5e-3
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        rows, pull, _ = split(g)[0].linearise(step.x)
+        return step.reverse(step.x0) - self.weight * step.pins.free(pull(torch.ones_like(rows))), None
+
+
+@dataclass(frozen=True)
+class Conditional:
+    """The paper's Conditional: a planner trained with labels that say whether a window obeys the constraints, asked for one that
+    does (conditioning.py); its step is the plain one.
+
+    weight   of classifier-free guidance: 1 is the conditioned estimate itself, above it two network calls a step
+    """
+
+    weight: float = 2.0
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        return step.reverse(step.x0), None
+
+
+@dataclass(frozen=True)
+class Terminal:
+    """Only the trajectory that sampling ends at is asked to obey, as DiRecT does (Giaretta et al., 2026): the clean estimate is
+    projected and the sample follows by the whole displacement, x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0).
+
+    rounds, dynamics_from   as in Projected
+    """
+
+    rounds: int = 30
+    dynamics_from: float = DYNAMICS_FROM
+
+    def init(self, x: Traj, g: Constraint) -> Warm | None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
+        x0, state = project_from(due(g, step.level, self.dynamics_from), step.x0, step.pins, state, self.rounds)
+        return step.reverse(step.x0) + step.level * (x0 - step.x0), state
+
+
+@dataclass(frozen=True)
+class FinalProjection:
+    """The unconstrained plan, projected once when it is done."""
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        x = step.reverse(step.x0)
+        return (project_from(g, x, step.pins, None, ADMM_ROUNDS)[0] if step.last else x), None
+
+
+@dataclass(frozen=True)
+class BestOf:
+    """k unconstrained plans a seed, of which planning.py keeps the safest: the least sum of [g]_+, the first among equals.
+
+    k   plans a seed; the network calls are k-fold
+    """
+
+    k: int = 8
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        return step.reverse(step.x0), None

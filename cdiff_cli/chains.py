@@ -1,0 +1,261 @@
+"""The nearest trajectory on a control-barrier chain, exactly: the values of the barrier h are projected onto
+
+    h_{k+1} >= gamma h_k                                                  plain: weighted isotonic regression
+    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0            high-order: a small quadratic program
+
+with the weights that a waypoint's way to another value of h has, then each waypoint moves to its new level set. Half-spaces have
+planes for level sets and balls spheres, so that the nearest point is along the normal and the result is the nearest trajectory.
+"""
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from cdiff_cli.approach import Approach
+from cdiff_cli.constraint import Chain, Pins, Rows, Traj
+from cdiff_cli.levels import Affine, Ellipsoid, times
+
+SHORT = 32  # indices up to which all blocks are written out at once
+FLIPS = 1000  # changes of the active set; a handful is usual
+LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
+NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
+
+
+def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
+    """The nearest trajectory to z with g <= 0; waypoints are pinned as a whole or not at all."""
+    level = chain.acting
+    if isinstance(level, Approach):
+        return _by_linearising(chain, level, z, pins)
+    if isinstance(level, Affine):
+        h, unit = -level(z), -level.a
+        way = level.a.square().sum(-1).clamp_min(1e-30).rsqrt()
+        low = None
+        unit = unit * way[..., None]
+    else:
+        assert isinstance(level, Ellipsoid)
+        y = level.scaled(z)
+        y[..., 0] += NUDGE
+        length = y.norm(dim=-1)
+        h, way, low = level.m * (length - 1), level.axes[..., 0] / level.m, -level.m
+    if not bool((chain.rows_of(-h) > 0).any()):
+        return z
+    target = _nearest_values(chain, h, way.square().expand(*way.shape[:-1], h.shape[1]), low, pins)
+    step = (target - h) * way
+    if isinstance(level, Ellipsoid):
+        return z + times((step / length)[..., None] * y, level.which)
+    return z + step[..., None] * unit
+
+
+def _by_linearising(chain: Chain, level: Approach, z: Traj, pins: Pins) -> Traj:
+    """A nearest trajectory to z, by the exact projection onto the chain of the barriers linearised where the last one ended: each
+    moves its waypoint along its gradient there. A local solution; what it ends on satisfies the chain to rounding.
+    """
+    x = z
+    for _ in range(LINEARISED):
+        h = -level(x)
+        if not bool((chain.rows_of(-h) > 0).any()) and x is not z:
+            break
+        slope = -level.gradient(x)
+        size = slope.square().sum(-1).clamp_min(1e-30)
+        there = h + (slope * (z - x)).sum(-1)
+        target = _nearest_values(chain, there, 1 / size, None, pins)
+        x = z + ((target - there) / size)[..., None] * slope
+    return x
+
+
+def _nearest_values(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins) -> Rows:
+    """The nearest values to h that the chain allows, those of held waypoints kept; none below `low`, which has the dimensions of
+    a number of the level: h at the centre of a ball.
+    """
+    first, last = pins.loose
+    if chain.alpha2 is not None:
+        return _nearest_under(chain, h, weight, low, first, last)
+    gamma = 1 - chain.alpha
+    target = _nearest_between(h, gamma, weight, first, last)
+    by_waypoint = low is not None and low.ndim > 0 and low.shape[-1] > 1
+    if low is not None and (first == 0 or by_waypoint):
+        return torch.where(pins.held, target, torch.maximum(target, _lowest_chain(low, gamma, h)))
+    return target
+
+
+def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
+    """The lowest chain whose values are nowhere below `low` [], [horizon | 1] or [batch | 1, horizon | 1]: v_k = max over i <= k of
+    gamma^(k - i) low_i. A bound on the first index, which the chain hands on, exact where the balls are all of one size.
+    """
+    power = _powers(gamma, h.shape[1] - 1, h)
+    if low.ndim == 0 or low.shape[-1] == 1:
+        return power * low
+    index = torch.arange(h.shape[1], device=h.device)
+    past = index - index[:, None]
+    return torch.where(past >= 0, power[past.clamp_min(0)] * low[..., None], -torch.inf).amax(-2)
+
+
+# plain chains ---------------------------------------------------------------------------------------------------------
+
+
+def nearest_chain(h: Rows, gamma: float, weight: Tensor, fixed: Tensor) -> Rows:
+    """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k where fixed.
+
+    In y_k = v_k / gamma^k this is isotonic regression: pooled adjacent violators. The fixed ends bound it, and a bounded
+    isotonic regression is the clipped one. Computed in float64, returned in the dtype of h.
+
+    h [batch, n], weight [n] or [batch, n] > 0, fixed [n] (only a first and a last run of indices may be fixed)
+    """
+    free = torch.nonzero(~fixed)[:, 0]
+    first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
+    return _nearest_between(h, gamma, weight, first, last)
+
+
+def _nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: int) -> Rows:
+    """The same with the indices from first to before last free."""
+    n = h.shape[1]
+    if first == last:
+        return h
+    begin = max(first - 1, 0)  # of what is fixed before, the last value alone counts
+    if last == n and n - begin <= SHORT:
+        best = _by_all_blocks(h[:, begin:].double(), gamma, weight[..., begin:].double(), first > 0).to(h)
+        if first > 0:
+            best[:, 0] = h[:, begin]
+        return best if begin == 0 else torch.cat((h[:, :begin], best), 1)
+    best, _ = pool_violators(h[:, first:last].double(), gamma, weight[..., first:last].double())
+    if last - first == n:
+        return best.to(h)
+    power = _powers(gamma, last - first, best)[1:]
+    if first > 0:
+        best = torch.maximum(best, power * h[:, first - 1 : first])
+    if last < n:  # powers are kept off 0: a last value of 0 bounds all by 0, and a bound must fit into the dtype of h
+        best = torch.minimum(best, h[:, last : last + 1] / power.flip(0).clamp_min(torch.finfo(h.dtype).tiny ** 0.5))
+    return torch.cat((h[:, :first], best.to(h), h[:, last:]), 1)
+
+
+def _by_all_blocks(h: Rows, gamma: float, weight: Tensor, start_fixed: bool) -> Rows:
+    """The nearest chain by the max-min formula of isotonic regression: with the value v_i^j of the block from i to j,
+
+        v_k = max over i <= k of  gamma^(k - i)  min over j >= k of  v_i^j
+
+    n^2 blocks a plan, but a handful of operations in all. A fixed first value is a first index of infinite weight.
+    """
+    n = h.shape[1]
+    once, twice, power, before = _blocks(gamma, n, start_fixed, h.dtype, h.device)
+    block = ((weight * h) @ once) / (weight @ twice)
+    least = block.view(len(h), n, n).cummin(2).values  # j runs backwards, and so does k
+    return torch.addcmul(before, power, least).amax(1).flip(1)
+
+
+@lru_cache(maxsize=16)
+def _blocks(gamma: float, n: int, start_fixed: bool, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """Matrices that sum w h and w over all blocks from i to j with the powers of gamma, and its square, from i on [n, n n];
+    gamma^(k - i), and -inf where k < i [n, n]. j and k run backwards.
+    """
+    index = torch.arange(n)
+    m, i, j = index[:, None, None], index[:, None], index.flip(0)
+    power = gamma ** torch.arange(n, dtype=torch.float64)
+    within = (m >= i) & (m <= j) | (m == i)  # a block with j < i never counts: it is there to divide by something
+    if start_fixed:
+        within = torch.where(i == 0, m == 0, within)
+    once = torch.where(within, power[(m - i).clamp_min(0)], 0.0)
+    before = torch.where(j < i, -torch.inf, 0.0).to(dtype)
+    ahead = torch.where(j < i, 0.0, power[(j - i).clamp_min(0)])
+    made = (once.flatten(1), once.square().flatten(1), ahead, before)
+    return tuple(v.to(device, dtype) for v in made)
+
+
+def pool_violators(h: Rows, gamma: float, weight: Tensor) -> tuple[Rows, int]:
+    """The nearest chain to h by pooled adjacent violators, and the number of rounds it took.
+
+    A block of value v that starts at index s stands for v, gamma v, gamma^2 v, ...; the value nearest to its h is
+
+        v = N / D,   N = sum_k w_k gamma^(k - s) h_k,   D = sum_k w_k gamma^(2 (k - s))
+
+    and the next block violates if its value is < gamma^length v. A round merges every run of consecutive violators, of all
+    plans at once. Powers count from the first index of the merged block: they are at most 1, the first is 1, and one that
+    underflows belongs to a term that no longer counts.
+
+    Rounds (tests/benchmarks/chain.py): at gamma = 0.95 at most 17 for noise, random walks and smooth curves up to n = 1536; at
+    gamma = 0.999 and n = 384 noise takes 10, a walk 25, a smooth curve 47. The worst measured is a lone value far below the
+    end of a rise or far above its beginning, which takes in one neighbour a round: as many as n rounds, or about
+    log(distance) / log(1 / gamma) where that is fewer.
+
+    h [batch, n], weight [n] or [batch, n] > 0
+    """
+    batch, n = h.shape
+    power = _powers(gamma, n, h)
+    powers = torch.stack((power, power.square()))
+    sums = h.new_full((2, batch, n + 1), torch.nan)  # N and D of all plans on one line; a NaN between two violates nothing
+    sums[0, :, :n], sums[1, :, :n] = weight * h, weight
+    sums = sums.flatten(1)
+    index = torch.arange(sums.shape[1] + 1, device=h.device)
+    start, value, rounds = index, sums[0] / sums[1], 0  # start: of each block, then the end of the line
+    due = gamma * value  # what the next block has to reach
+    while True:
+        leads = torch.ones_like(start, dtype=torch.bool)  # the blocks that stay, then the end of the line
+        torch.logical_not(value[1:] < due[:-1], out=leads[1:-1])
+        lead = leads.nonzero()[:, 0]
+        if len(lead) == len(start):
+            break
+        rounds += 1
+        into = leads[:-1].cumsum(0) - 1
+        merged = start.index_select(0, lead)
+        scale = powers.index_select(1, start[:-1] - merged.index_select(0, into))
+        sums = sums.new_zeros(2, len(lead) - 1).index_add_(1, into, scale * sums)
+        start, value = merged, sums[0] / sums[1]
+        due = power.index_select(0, start[1:] - start[:-1]) * value
+    if rounds == 0:
+        return h, 0
+    block = torch.repeat_interleave(start[1:] - start[:-1])
+    v = value.index_select(0, block) * power.index_select(0, index[:-1] - start.index_select(0, block))
+    return v.view(batch, n + 1)[:, :n], rounds
+
+
+def _powers(gamma: float, n: int, like: Tensor) -> Tensor:
+    """gamma^0, ..., gamma^n."""
+    return gamma ** torch.arange(n + 1, device=like.device).to(like.dtype)
+
+
+# high-order chains ----------------------------------------------------------------------------------------------------
+
+
+def _nearest_under(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int) -> Rows:
+    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_flipping). Where that asks for
+    less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.
+    """
+    one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
+    D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)
+    v[:, free] += _by_flipping(D[:, free], v @ D.T, 1 / weight.double()[..., free])
+    if low is not None and bool((v < low).any()):
+        order = len(chain.coefficients) - 1
+        v = torch.maximum(v, low)
+        for k in range(max(first, order), last):
+            due = sum(
+                (-weight * v[:, k - order + at] for at, weight in enumerate(chain.coefficients[:-1])), torch.zeros_like(v[:, 0])
+            )
+            v[:, k] = torch.maximum(v[:, k], due)
+    return v.to(h)
+
+
+def _by_flipping(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
+    """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0 [batch, n], for D [r, n], b [batch, r], way [n] or [batch, n], by its dual:
+
+        d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
+
+    Principal pivoting (Judice and Pires, 1994): given the set of rows where b + Q lam = 0, elsewhere lam = 0, all rows of a wrong
+    sign change sides at once; where that has not helped three times in a row, the last of them alone, which ends for certain.
+    """
+    Q = (D * way[..., None, :]) @ D.T
+    one, rounding = torch.eye(len(D)).to(Q), 1e-12 * (1 + b.abs().amax(1, keepdim=True))
+    active = b < -rounding
+    best, left = torch.full_like(b[:, :1], len(D) + 1), torch.full_like(b[:, :1], 3)
+    lam = torch.zeros_like(b)
+    for _ in range(FLIPS):
+        both = active[:, :, None] & active[:, None, :]
+        lam = torch.linalg.solve(torch.where(both, Q, one), torch.where(active, -b, 0.0))
+        wrong = torch.where(active, lam < 0, b + times(lam, Q) < -rounding)
+        if not bool(wrong.any()):
+            break
+        count = wrong.sum(1, keepdim=True)
+        left = torch.where(count < best, 3.0, left - 1)
+        best = torch.minimum(best, count.to(best))
+        last = wrong & (wrong.flip(1).cumsum(1).flip(1) == 1)
+        active = active ^ torch.where(left < 0, last, wrong)
+    return (lam.clamp_min(0) @ D) * way

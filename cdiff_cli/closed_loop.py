@@ -1,0 +1,167 @@
+"""`cdiff rollout` on control tasks: act, measure, leave a run directory behind; and the calibration of margins."""
+
+import platform
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from cdiff_cli import control_figures, metrics
+from cdiff_cli.baselines import BestOf
+from cdiff_cli.control import Controller, Episodes, control
+from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.experiment import Finished, Tick
+from cdiff_cli.margins import Margin, Margins, conformal, errors, write_margins
+from cdiff_cli.methods import Unconstrained
+from cdiff_cli.recipe import shown
+from cdiff_cli.request import Resolved
+from cdiff_cli.runs import Row, new_run, write_rows, write_yaml
+from cdiff_cli.tasks import ControlTask
+from cdiff_cli.training import device_name, git_commit
+
+
+def control_run(
+    resolved: Resolved, root: Path, tick: Tick, video: str | None = None, *, name: str | None = None, pictures: bool = True
+) -> Finished:
+    """Act for an episode a seed, replanning as the preset says; measure; write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
+    acting, options = controller(resolved), resolved.options
+    env_options = parse_env(acting.task, options.env)
+    with new_run(root, name or f"rollout-{options.task}-{options.method}-{options.preset}") as run:
+        recorder = control_figures.Recorder(run.path / f"rollout.{video}", acting) if video else None
+        env = env_options | ({"render": True} if video else {})
+        done = control(acting, resolved.seeds, env, on_step=lambda k, n: tick("control", k, n), on_frame=recorder)
+        levels = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
+        rows = _rows(resolved, acting, done, levels)
+        _write(run.path, resolved, acting, done, rows)
+        title = f"{options.task}, {options.method} ({options.preset}), n = {len(rows)}"
+        if pictures:
+            control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
+        if recorder:
+            recorder.write(done, levels)
+    notes = (
+        [f"warning: {int(done.diverged.sum())} of {len(rows)} episodes diverged and were stopped"] if done.diverged.any() else []
+    )
+    counts = {"episodes": len(rows), "safe_executed": int(sum(row["safe_executed"] for row in rows))}
+    verdict = f"executed     {counts['safe_executed']} of {len(rows)} episodes safe at every step"
+    return Finished(run.path, rows, run.path / "rollout.png", cast(Any, counts), verdict, tuple(notes))
+
+
+def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margins]:
+    """Act without a margin, and write the margins that cover how far execution left the plans, beside the checkpoint."""
+    acting, checkpoint = controller(resolved), resolved.checkpoint
+    assert checkpoint is not None
+    done = control(acting, resolved.seeds, parse_env(acting.task, resolved.options.env), on_step=lambda k, n: tick("control", k, n))
+    executed = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
+    scores = errors(done.foreseen, executed)
+    by_name = {
+        part.name: Margin(
+            margin=round(max(conformal(each, level), 0.0), 4), median=round(float(np.median(each)), 4), largest=round(each.max(), 4)
+        )
+        for part, each in zip(acting.g.parts, scores.T, strict=True)
+    }
+    found = Margins(
+        level=level,
+        episodes=len(scores),
+        seed=resolved.options.seed,
+        weights_sha256=checkpoint.card.weights_sha256,
+        method=resolved.options.method,
+        preset=resolved.options.preset,
+        constraints=by_name,
+    )
+    return write_margins(checkpoint.path, resolved.constraints_path.stem, found), found
+
+
+def controller(resolved: Resolved) -> Controller:
+    """What acting needs."""
+    problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
+    if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
+        raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
+    if isinstance(resolved.method, BestOf):
+        raise CdiffError(f"{options.method}: only for whole plans, and {problem.task.name} plans anew at each step; choose another")
+    execute = preset.execute if options.execute is None else options.execute
+    inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
+    ahead = 1 if inverse is None else inverse.ahead
+    if not 1 <= execute <= problem.horizon - ahead:
+        raise CdiffError(
+            f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
+        )
+    warm = preset.warm if options.warm is None else options.warm
+    if warm is not None and not 0 < warm <= 1:
+        raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
+    if options.action_noise < 0:
+        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
+    return Controller(
+        task=cast(ControlTask, problem.task),
+        denoiser=resolved.guided or problem.denoiser,
+        schedule=problem.schedule,
+        frame=checkpoint.frame,
+        inverse=checkpoint.inverse,
+        g=problem.g,
+        enforced=problem.enforced,
+        method=resolved.method,
+        device=problem.device,
+        kernel=resolved.kernel,
+        extra_steps=resolved.extra_steps,
+        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
+        temperature=preset.temperature,
+        ahead=ahead,
+        execute=execute,
+        warm=warm,
+        action_noise=options.action_noise,
+    )
+
+
+def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:
+    """["pattern=chaser"] as options of the task's environment; CdiffError where it has no such option or value."""
+    known: Mapping[str, tuple[Any, ...]] = getattr(task, "env_options", {})
+    found = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or name not in known:
+            has = ", ".join(known) or "none"
+            raise CdiffError(f'--env: {task.name} has no option "{name}"{suggestion(name, known)}; its options are: {has}')
+        values = {str(value).lower(): value for value in known[name]}
+        if text.lower() not in values:
+            raise CdiffError(f'--env {name}: expected one of {", ".join(values)}, found "{text}"{suggestion(text, values)}')
+        found[name] = values[text.lower()]
+    return found
+
+
+def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -> list[Row]:
+    space = acting.task.make_env().action_space
+    measured = metrics.control_metrics(done, levels, (space.low.astype(float), space.high.astype(float)))
+    env = {"env": " ".join(resolved.options.env)} if resolved.options.env else {}
+    return [
+        resolved.row() | env | {"seed": seed} | values | {"calls": acting.calls * resolved.calls_a_step}
+        for seed, values in zip(resolved.seeds, measured, strict=True)
+    ]
+
+
+def _write(path: Path, resolved: Resolved, acting: Controller, done: Episodes, rows: list[Row]) -> None:
+    about = {
+        "command": ["cdiff", *sys.argv[1:]],
+        "commit": git_commit(),
+        "versions": {name: version(name) for name in ("torch", "numpy", "mujoco", "gymnasium", "pybullet")},
+        "python": platform.python_version(),
+        "device": device_name(acting.device),
+        "wall_s": round(float(done.latency_s.sum()), 3),
+        "execute": acting.execute,
+        "warm": acting.warm,
+        "temperature": acting.temperature,
+    }
+    write_yaml(path / "run.yaml", about | resolved.config())
+    arrays: dict[str, Any] = {name: value for name, value in asdict(done).items() if name not in ("observed", "info")}
+    arrays |= done.observed | {f"info.{name}": value for name, value in done.info.items()}
+    layout: Any = {"layout": np.array(acting.task.layout), "parts": np.array([part.name for part in acting.g.parts])}
+    np.savez_compressed(path / "rollout.npz", **arrays, **layout, seed=np.array(resolved.seeds))
+    write_rows(path / "rows.csv", rows)
+
+
+def calibrated_text(path: Path, found: Margins) -> str:
+    """What `cdiff rollout --calibrate` prints."""
+    each = "; ".join(f"{name} {m.margin:g} (median {m.median:g}, largest {m.largest:g})" for name, m in found.constraints.items())
+    return f"margins at level {found.level:g} from {found.episodes} episodes: {each}\nwritten to {shown(path)}"

@@ -1,0 +1,376 @@
+"""Receding-horizon control, the paper's Algorithm 1: observe, bind, sample, act, at every environment step."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
+from cdiff_cli.frames import Frame
+from cdiff_cli.methods import AlmState
+from cdiff_cli.networks import InverseDynamics
+from cdiff_cli.planning import MARGIN, synchronise
+from cdiff_cli.projection import project_from
+from cdiff_cli.tasks import ControlTask
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Controller:
+    """All that acting needs, resolved.
+
+    g             as declared: what is scored                                    environment units
+    enforced      what plans obey: g, tightened by the margin                    environment units
+    temperature   factor on all noise: below 1 plans stay nearer the mean
+    ahead         waypoints between the states that the inverse dynamics model is asked about
+    execute       environment steps a plan is followed
+    warm          share of the diffusion steps done again on the last plan, moved on by what was executed, from the multipliers
+                  it ended with, moved on likewise; None: all, from noise
+    action_noise  standard deviation of what is added to each input, over half its range: a disturbance, not ours to know
+    """
+
+    task: ControlTask
+    denoiser: Denoiser
+    schedule: Schedule
+    frame: Frame
+    inverse: InverseDynamics
+    g: Constraint
+    enforced: Constraint
+    method: Method
+    device: torch.device
+    kernel: str = "ddpm"
+    extra_steps: int = 0
+    polish: bool = False
+    temperature: float = 1.0
+    ahead: int = 1
+    execute: int = 1
+    warm: float | None = None
+    action_noise: float = 0.0
+
+    @property
+    def horizon(self) -> int:
+        return self.frame.mean.shape[0]
+
+    @property
+    def calls(self) -> int:
+        """Network calls a plan, the first of an episode apart where plans are warm."""
+        steps = self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
+        return steps + self.extra_steps
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Executed episodes; entries after an episode's end are NaN.
+
+    x           states [n, steps + 1, dim];  u inputs [n, steps, m];  reward [n, steps]
+    planned     the state that the plan followed foresaw for each state [n, steps + 1, dim]; the first is the start itself
+    foreseen    value of each part's level at `planned`, on what was observed when it was planned [n, steps + 1, parts]
+    observed    observed quantities by name, each [n, steps + 1]
+    violation   sum over waypoints and rows of [g]_+ of each plan, as declared [n, steps], NaN where none was made
+    info        numbers that the environment told beside the reward, by name, each [n, steps]
+    fell        whether the episode was ended by the environment [n]
+    diverged    whether it was ended because its plan or its state was no longer finite [n]
+    latency_s   wall time of each control step at which plans were made, of all episodes at once; network_s the network's part
+    """
+
+    x: Array
+    u: Array
+    reward: Array
+    planned: Array
+    foreseen: Array
+    observed: dict[str, Array]
+    violation: Array
+    info: dict[str, Array]
+    fell: NDArray[np.bool_]
+    diverged: NDArray[np.bool_]
+    latency_s: Array
+    network_s: Array
+
+
+def control(
+    controller: Controller,
+    seeds: Sequence[int],
+    env_options: Mapping[str, Any] | None = None,
+    steps: int | None = None,
+    on_step: Callable[[int, int], None] | None = None,
+    on_frame: Callable[[int, Any, Array], None] | None = None,
+) -> Episodes:
+    """One episode a seed, planned for together. A seed's environment and noise do not depend on its neighbours.
+
+    on_step    called with the number of steps so far and of all
+    on_frame   called before each step of the first episode with the step, its environment and the plan followed [horizon, dim]
+    """
+    task = controller.task
+    total = task.max_steps if steps is None else steps
+    envs = [task.make_env(**(env_options or {})) for _ in seeds]
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    disturbances = [np.random.default_rng((seed, 1)) for seed in seeds]
+    low, high = envs[0].action_space.low, envs[0].action_space.high
+    log = _Log(controller, len(seeds), total, len(low))
+    try:
+        states = np.stack([task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)])
+        log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
+        alive, plans, since = np.arange(len(seeds)), np.empty((len(seeds), controller.horizon, states.shape[1])), 0
+        method = _Resumed(controller.method, controller.execute)
+        while log.done < total and len(alive):
+            tau = log.done
+            if since == 0:
+                last = plans[alive] if tau and controller.warm is not None else None
+                method = _Resumed(controller.method, controller.execute, method.state if last is not None else None)
+                found = _plan(controller, method, states[alive], log.now(alive), last, [generators[i] for i in alive])
+                plans[alive] = found.x
+                log.plan(tau, alive, found)
+                alive = log.end(log.diverged, alive, ~np.isfinite(found.x).all(axis=(1, 2)))
+                if not len(alive):
+                    break
+            target = plans[alive, min(since + controller.ahead, controller.horizon - 1)]
+            u = controller.inverse(*(torch.from_numpy(s).float().to(controller.device) for s in (states[alive], target)))
+            if on_frame and alive[0] == 0:
+                on_frame(tau, envs[0], plans[0])
+            inputs = u.double().cpu().numpy()
+            fell, diverged = np.zeros(len(alive), dtype=bool), np.zeros(len(alive), dtype=bool)
+            for row, i in enumerate(alive):
+                disturbance = controller.action_noise * disturbances[i].normal(size=len(low)) * (high - low) / 2
+                push = np.clip(inputs[row] + disturbance, low, high).astype(np.float32)
+                obs, reward, terminated, _, info = envs[i].step(push)
+                states[i] = task.observe(obs)
+                log.act(tau, int(i), push, float(reward), info)
+                fell[row], diverged[row] = terminated, not np.isfinite(states[i]).all()
+            since = (since + 1) % controller.execute
+            log.foresee(tau + 1, plans[alive, since or controller.execute], alive, since or controller.execute)
+            log.observe(tau + 1, states[alive], [task.observed(envs[i]) for i in alive], alive)
+            log.end(log.diverged, alive, diverged)
+            log.end(log.fell, alive, fell & ~diverged)
+            alive = alive[~(fell | diverged)]
+            log.done += 1
+            if on_step:
+                on_step(log.done, total)
+    finally:
+        for env in envs:
+            env.close()
+    return log.episodes()
+
+
+@dataclass(frozen=True)
+class _InUnits:
+    """The method on coordinates y = scale * z, which have the units of the environment: what is near is measured there. The scales
+    of z differ a hundredfold along the window, and a method on z would leave the first waypoints, which are all that is
+    executed, as they are. The reverse step is linear, so that it is the same step in y.
+
+    scale   [horizon, dim]
+    """
+
+    method: Method
+    scale: Tensor
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        return self.method.init(x, g)
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        scale = self.scale
+        y = Step(
+            x=scale * step.x,
+            x0=scale * step.x0,
+            beta=step.beta,
+            level=step.level,
+            reverse=lambda clean: scale * step.reverse(clean / scale),
+            pins=Pins(step.pins.mask, scale * step.pins.values),
+            last=step.last,
+        )
+        out, state = self.method.step(y, g, state)
+        return out / scale, state
+
+
+@dataclass
+class _Resumed:
+    """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
+    to be found again in the few steps of a warm plan.
+
+    state   of the method after its last step
+    """
+
+    method: Method
+    shift: int
+    state: Any = None
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        fresh, last = self.method.init(x, g), self.state
+        if isinstance(fresh, AlmState) and isinstance(last, AlmState):
+            return fresh._replace(lam=self._moved(fresh.lam, last.lam, g, x.shape[1]))
+        return self._moved(fresh, last, g, x.shape[1]) if isinstance(fresh, torch.Tensor) else fresh
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        x, self.state = self.method.step(step, g, state)
+        return x, self.state
+
+    def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
+        """The last rows moved on part by part, the new ones at the end as they begin; all as they begin where an episode ended."""
+        if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
+            return fresh
+        out, at = fresh.clone(), 0
+        for part in g.parts:
+            count = len(part.labels(horizon))
+            out[:, at : at + count - self.shift] = last[:, at + self.shift : at + count]
+            at += count
+        return out
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Plans of one control step: x [n, horizon, dim], the constraint they were scored by, times."""
+
+    x: Array
+    g: Constraint
+    total_s: float
+    network_s: float
+
+
+def _plan(
+    controller: Controller,
+    method: Method,
+    states: Array,
+    observed: Mapping[str, Array],
+    last: Array | None,
+    generators: Sequence[torch.Generator],
+) -> _Found:
+    """Plans that begin at the states [n, dim]."""
+    device, horizon, network_s = controller.device, controller.horizon, 0.0
+    synchronise(device)
+    began = time.perf_counter()
+
+    def timed(x: Traj, t: int) -> Traj:
+        nonlocal network_s
+        synchronise(device)
+        before = time.perf_counter()
+        x0 = controller.denoiser(x, t)
+        synchronise(device)
+        network_s += time.perf_counter() - before
+        return x0
+
+    with torch.inference_mode():
+        here = torch.from_numpy(states)
+        to = controller.frame.at(here)
+        seen = {name: torch.from_numpy(values) for name, values in observed.items()}
+        scored, obeyed = (g.bind(seen, controller.task.dt, horizon) for g in (controller.g, controller.enforced))
+        like = torch.empty(0, device=device)
+        unit = torch.ones_like(to.scale)
+        g = pull_back(obeyed, to.centre, unit).to(like)
+        shape = (horizon, states.shape[1])
+        mask = torch.zeros(shape, dtype=torch.bool, device=device)
+        mask[0] = True
+        begin = to.encode(here[:, None].expand(-1, horizon, -1))
+        pins = Pins(mask, begin.to(like))
+        schedule, first = controller.schedule, None
+        draws = iter(_draws(generators, schedule.n_steps + 1, shape, controller.temperature).to(device).unbind(1))
+        if last is not None:
+            steps = controller.calls - controller.extra_steps
+            schedule = schedule.until(steps)
+            moved = np.concatenate((last[:, controller.execute :], last[:, -1:].repeat(controller.execute, 1)), 1)
+            a = schedule.alpha_bar[-1]
+            first = (a**0.5 * to.encode(torch.from_numpy(moved)).to(like)) + (1 - a) ** 0.5 * next(draws)
+        z = sample(
+            timed,
+            schedule,
+            _InUnits(method, to.scale.to(like)),
+            g,
+            pins,
+            lambda: next(draws),
+            kernel=KERNELS[controller.kernel],
+            extra_steps=controller.extra_steps,
+            first=first,
+        )
+        z64 = z.double().cpu()
+        if controller.polish:
+            g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
+            y, _ = project_from(g64, to.scale * z64, Pins(mask.cpu(), to.scale * begin), None, 0)
+            z64 = y / to.scale
+        x = to.decode(z64).numpy()
+        x[:, 0] = states
+    synchronise(device)
+    return _Found(x, scored, time.perf_counter() - began, network_s)
+
+
+def _draws(generators: Sequence[torch.Generator], count: int, shape: tuple[int, int], temperature: float) -> torch.Tensor:
+    """Noise for a whole plan, one generator an episode [n, count, *shape]."""
+    return temperature * torch.stack([torch.randn((count, *shape), generator=generator) for generator in generators])
+
+
+class _Log:
+    """What happened so far, episode by episode."""
+
+    def __init__(self, controller: Controller, n: int, steps: int, inputs: int) -> None:
+        dim, parts = len(controller.task.layout), len(controller.g.parts)
+        self.controller, self.done = controller, 0
+        self.x, self.planned = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
+        self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
+        self.foreseen = np.full((n, steps + 1, parts), np.nan)
+        self.observed = {name: np.full((n, steps + 1), np.nan) for name in controller.task.observable}
+        self.violation = np.full((n, steps), np.nan)
+        self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        self.info: dict[str, Array] = {}
+        self.latency: list[float] = []
+        self.network: list[float] = []
+
+    def now(self, which: NDArray[np.intp]) -> dict[str, Array]:
+        return {name: values[which, self.done] for name, values in self.observed.items()}
+
+    def observe(self, tau: int, states: Array, observed: Sequence[Mapping[str, float]], which: NDArray[np.intp]) -> None:
+        self.x[which, tau] = states
+        if tau == 0:
+            self.planned[which, 0] = states
+        for name, values in self.observed.items():
+            values[which, tau] = [each[name] for each in observed]
+
+    def plan(self, tau: int, which: NDArray[np.intp], found: _Found) -> None:
+        self.violation[which, tau] = found.g(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
+        self.latency.append(found.total_s)
+        self.network.append(found.network_s)
+        self.levels = [_levels(part, torch.from_numpy(found.x)) for part in found.g.parts]
+        self.rows = {int(i): row for row, i in enumerate(which)}
+
+    def end(self, flags: NDArray[np.bool_], which: NDArray[np.intp], ended: Any) -> NDArray[np.intp]:
+        """Those of `which` that go on; the others are flagged."""
+        flags[which[ended]] = True
+        return which[~ended]
+
+    def foresee(self, tau: int, states: Array, which: NDArray[np.intp], waypoint: int) -> None:
+        self.planned[which, tau] = states
+        rows = [self.rows[int(i)] for i in which]
+        for k, values in enumerate(self.levels):
+            self.foreseen[which, tau, k] = values[rows, waypoint]
+
+    def act(self, tau: int, i: int, u: Array, reward: float, info: Mapping[str, Any]) -> None:
+        self.u[i, tau], self.reward[i, tau] = u, reward
+        for name, value in info.items():
+            if isinstance(value, bool | int | float | np.number | np.bool_):
+                self.info.setdefault(name, np.full(self.reward.shape, np.nan))[i, tau] = float(value)
+
+    def episodes(self) -> Episodes:
+        return Episodes(
+            x=self.x,
+            u=self.u,
+            reward=self.reward,
+            planned=self.planned,
+            foreseen=self.foreseen,
+            observed=self.observed,
+            violation=self.violation,
+            info=self.info,
+            fell=self.fell,
+            diverged=self.diverged,
+            latency_s=np.array(self.latency),
+            network_s=np.array(self.network),
+        )
+
+
+def _levels(part: Any, x: torch.Tensor) -> Array:
+    """The part's level at every waypoint [n, horizon]; its rows' largest where it has none."""
+    level = getattr(part, "level", None)
+    values = part(x).amax(1, keepdim=True).expand(x.shape[:2]) if level is None else level(x)
+    return np.asarray(values.numpy())

@@ -1,0 +1,209 @@
+"""Acting: replanning at every step, on a point mass whose planner and inverse dynamics are known."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from cdiff_cli import metrics
+from cdiff_cli.constraint import Constraint, Waypoints
+from cdiff_cli.control import Controller, Episodes, control
+from cdiff_cli.data import Normaliser
+from cdiff_cli.diffusion import Schedule
+from cdiff_cli.frames import Frame
+from cdiff_cli.levels import Affine
+from cdiff_cli.methods import Projected, Unconstrained
+from cdiff_cli.networks import InverseDynamics
+from tests.problems import F64, chain, vec
+
+DT, H = 0.1, 6
+
+
+class Mass(gymnasium.Env):
+    """p' = p + dt v, v' = v + dt u; it falls where p > fall."""
+
+    action_space = gymnasium.spaces.Box(-10.0, 10.0, (1,), np.float32)
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def __init__(self, fall: float) -> None:
+        self.fall = fall
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.array([0.0, self.np_random.uniform(0.0, 0.1)])
+        return self.x.copy(), {}
+
+    def step(self, u):
+        self.x = self.x + DT * np.array([self.x[1], float(u[0])])
+        return self.x.copy(), float(self.x[1]), bool(self.x[0] > self.fall), False, {"contact": self.x[1] > 0.5}
+
+
+@dataclass(frozen=True)
+class MassTask:
+    name = "mass"
+    layout = ("p", "v")
+    actions = ("u",)
+    positions: tuple[str, ...] = ()
+    invariant = ("p",)
+    observable = ("clock",)
+    dt = DT
+    max_steps = 20
+
+    def make_env(self, fall: float = np.inf) -> Mass:
+        return Mass(fall)
+
+    def observe(self, obs: Any) -> np.ndarray:
+        return np.asarray(obs, dtype=np.float64)
+
+    def observed(self, env: Mass) -> dict[str, float]:
+        return {"clock": float(env.x[0])}
+
+
+def inverse() -> InverseDynamics:
+    """u = (v' - v) / dt, written as a network: silu(a) - silu(-a) = a, twice."""
+    net = InverseDynamics(2, 1, 2)
+    change = torch.tensor([[0.0, 0.0, 0.0, 1 / DT]])
+    weights = {"layers.0.weight": torch.cat((change, -change)), "layers.0.bias": torch.zeros(2)}
+    weights |= {"layers.2.weight": torch.tensor([[1.0, -1.0], [-1.0, 1.0]]), "layers.2.bias": torch.zeros(2)}
+    weights |= {"layers.4.weight": torch.tensor([[1.0, -1.0]]), "layers.4.bias": torch.zeros(1)}
+    net.load_state_dict(net.state_dict() | weights | {"low": torch.tensor([-10.0]), "high": torch.tensor([10.0])})
+    return net.requires_grad_(False)
+
+
+def frame() -> Frame:
+    """Windows that speed up by 0.1 a step: their mean is the plan."""
+    k = torch.arange(H, dtype=F64)
+    mean = torch.stack((torch.zeros(H, dtype=F64), 0.1 * k), 1)
+    return Frame(
+        Normaliser(vec(0.0, 0.0), vec(1.0, 1.0)),
+        torch.tensor([False, True]),
+        mean,
+        torch.zeros(H, 2, 2, dtype=F64),
+        torch.full((H, 2), 0.1, dtype=F64),
+    )
+
+
+def mean_window(x: torch.Tensor, t: int) -> torch.Tensor:
+    return torch.cat((x[:, :1], torch.zeros_like(x[:, 1:])), 1)
+
+
+LIMIT = chain(Affine(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5)
+FREE = Controller(
+    task=MassTask(),  # type: ignore[arg-type]
+    denoiser=mean_window,
+    schedule=Schedule.cosine(3),
+    frame=frame(),
+    inverse=inverse(),
+    g=LIMIT,
+    enforced=LIMIT,
+    method=Unconstrained(),
+    device=torch.device("cpu"),
+)
+
+
+def same(a: Episodes, b: Episodes, rows: slice) -> None:
+    for name in ("x", "u", "reward", "planned", "violation"):
+        np.testing.assert_array_equal(getattr(a, name)[rows], getattr(b, name))
+
+
+def test_the_plan_is_followed_exactly_by_the_exact_inverse_dynamics():
+    done = control(FREE, [0, 1])
+    np.testing.assert_allclose(done.x[:, 1:, 1] - done.x[:, :-1, 1], 0.1, atol=1e-5)  # the network is float32
+    np.testing.assert_allclose(done.x[:, :, 1], done.planned[:, :, 1], atol=1e-5)
+    np.testing.assert_allclose(done.observed["clock"], done.x[..., 0])
+
+
+def test_an_episode_does_not_depend_on_its_neighbours():
+    same(control(FREE, [3, 4, 5]), control(FREE, [4]), slice(1, 2))
+
+
+def test_projected_plans_never_let_the_speed_pass_its_limit():
+    free, held = control(FREE, [0, 1]), control(replace(FREE, method=Projected(), polish=True), [0, 1])
+    assert free.x[:, :, 1].max() > 1.5
+    assert held.x[:, :, 1].max() <= 0.75 + 1e-5
+    assert held.x[:, -1, 1].min() > 0.7  # and come close to it
+    assert held.violation.max() == 0.0
+    assert free.violation.max() > 0.1
+
+
+def test_a_barrier_approaches_its_limit_no_faster_than_alpha_allows():
+    held = control(replace(FREE, method=Projected(), polish=True), [0])
+    h = 0.75 - held.x[0, :, 1]
+    assert (h[1:] >= 0.5 * h[:-1] - 1e-5).all()
+
+
+def test_each_plan_is_followed_for_as_many_steps_as_asked():
+    done = control(replace(FREE, execute=4), [0], steps=10)
+    assert np.isfinite(done.violation[0]).nonzero()[0].tolist() == [0, 4, 8]
+    assert len(done.latency_s) == 3
+    np.testing.assert_allclose(done.x[0, 1:, 1] - done.x[0, :-1, 1], 0.1, atol=1e-5)
+    np.testing.assert_allclose(done.planned[0, :, 1], done.x[0, :, 1], atol=1e-4)
+
+
+def test_an_episode_that_falls_ends_alone():
+    done = control(FREE, [0, 1], {"fall": 0.5}, steps=20)
+    assert done.fell.all()
+    ends = np.isfinite(done.reward).sum(1)
+    assert (ends < 20).all()
+    for i, end in enumerate(ends):
+        assert np.isnan(done.x[i, end + 1 :]).all()
+        assert done.x[i, end, 0] > 0.5 >= done.x[i, end - 1, 0]
+
+
+def test_a_plan_that_is_not_finite_ends_its_episode_and_no_other():
+    def broken(x: torch.Tensor, t: int) -> torch.Tensor:
+        z = mean_window(x, t)
+        return torch.where(x[:, :1, 1:] > 0.55, torch.nan, z)
+
+    slow = control(replace(FREE, denoiser=broken), [0, 1])
+    assert slow.diverged.all()
+    assert not slow.fell.any()
+    assert 4 <= np.isfinite(slow.reward[0]).sum() <= 7
+
+
+def test_disturbed_inputs_are_recorded_as_executed():
+    done = control(replace(FREE, action_noise=0.1), [0], steps=8)
+    np.testing.assert_allclose(np.diff(done.x[0, :, 1]), DT * done.u[0, :, 0], atol=1e-6)
+    assert done.u[0, :, 0].std() > 0.3
+
+
+def test_a_warm_plan_redoes_its_share_of_the_steps():
+    calls = []
+
+    def counted(x: torch.Tensor, t: int) -> torch.Tensor:
+        calls.append(t)
+        return mean_window(x, t)
+
+    warm = replace(FREE, denoiser=counted, warm=0.4)
+    control(warm, [0], steps=3)
+    assert calls == [3, 2, 1, 1, 1]
+    assert warm.calls == 1
+
+
+def test_executed_levels_are_scored_against_what_was_observed_then():
+    done = control(FREE, [0, 1], steps=5)
+    levels = metrics.executed_levels(LIMIT, done.x, done.observed, DT)
+    np.testing.assert_allclose(levels[..., 0], done.x[..., 1] - 0.75)
+    np.testing.assert_allclose(done.foreseen[:, 1:, 0], done.planned[:, 1:, 1] - 0.75, atol=1e-6)
+
+
+def test_metrics_of_an_episode():
+    done = control(FREE, [0], steps=10)
+    levels = metrics.executed_levels(LIMIT, done.x, done.observed, DT)
+    (row,) = metrics.control_metrics(done, levels, (np.array([-10.0]), np.array([10.0])))
+    over = np.clip(done.x[0, :, 1] - 0.75, 0, None)
+    assert row["executed_violation"] == pytest.approx(over.sum())
+    assert row["violation_rate"] == pytest.approx(100 * (over > 1e-6).mean())
+    assert row["contacts"] == (done.x[0, 1:, 1] > 0.5).sum()
+    assert (row["fell"], row["saturation"], row["steps"]) == (0.0, 0.0, 10.0)
+
+
+def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
+    """The present state may be unsafe: what can still move is made safe, with no error."""
+    held = Constraint((Waypoints("speed", Affine(vec(0.0, 1.0), torch.tensor(0.01, dtype=F64))),))
+    done = control(replace(FREE, method=Projected(), polish=True, g=held, enforced=held), [0], steps=5)
+    assert done.x[0, 0, 1] > 0.01
+    assert done.x[0, 1:, 1].max() <= 0.01 + 1e-5
