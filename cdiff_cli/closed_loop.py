@@ -12,7 +12,8 @@ import numpy as np
 
 from cdiff_cli import control_figures, metrics
 from cdiff_cli.baselines import BestOf
-from cdiff_cli.control import Controller, Episodes, control
+from cdiff_cli.control import Controller, control
+from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
 from cdiff_cli.margins import Margin, Margins, conformal, errors, write_margins
@@ -111,6 +112,7 @@ def controller(resolved: Resolved) -> Controller:
         ahead=ahead,
         execute=execute,
         warm=warm,
+        brake=getattr(problem.task, "brake", None),
         action_noise=options.action_noise,
     )
 

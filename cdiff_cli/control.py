@@ -3,14 +3,17 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
+from cdiff_cli.episodes import Episodes, Log
+from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
 from cdiff_cli.methods import AlmState
 from cdiff_cli.networks import InverseDynamics
@@ -19,6 +22,7 @@ from cdiff_cli.projection import project_from
 from cdiff_cli.tasks import ControlTask
 
 Array = NDArray[np.float64]
+TOLERANCE = 1e-3  # of a finished plan's g, environment units: beyond it the projection has found no plan that obeys
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,8 @@ class Controller:
     execute       environment steps a plan is followed
     warm          share of the diffusion steps done again on the last plan, moved on by what was executed, from the multipliers
                   it ended with, moved on likewise; None: all, from noise
+    brake         state -> input that is used where the last projection leaves a plan outside of what it was to obey; None: the
+                  plan's own
     action_noise  standard deviation of what is added to each input, over half its range: a disturbance, not ours to know
     """
 
@@ -51,6 +57,7 @@ class Controller:
     ahead: int = 1
     execute: int = 1
     warm: float | None = None
+    brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
 
     @property
@@ -62,35 +69,6 @@ class Controller:
         """Network calls a plan, the first of an episode apart where plans are warm."""
         steps = self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
         return steps + self.extra_steps
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """Executed episodes; entries after an episode's end are NaN.
-
-    x           states [n, steps + 1, dim];  u inputs [n, steps, m];  reward [n, steps]
-    planned     the state that the plan followed foresaw for each state [n, steps + 1, dim]; the first is the start itself
-    foreseen    value of each part's level at `planned`, on what was observed when it was planned [n, steps + 1, parts]
-    observed    observed quantities by name, each [n, steps + 1]
-    violation   sum over waypoints and rows of [g]_+ of each plan, as declared [n, steps], NaN where none was made
-    info        numbers that the environment told beside the reward, by name, each [n, steps]
-    fell        whether the episode was ended by the environment [n]
-    diverged    whether it was ended because its plan or its state was no longer finite [n]
-    latency_s   wall time of each control step at which plans were made, of all episodes at once; network_s the network's part
-    """
-
-    x: Array
-    u: Array
-    reward: Array
-    planned: Array
-    foreseen: Array
-    observed: dict[str, Array]
-    violation: Array
-    info: dict[str, Array]
-    fell: NDArray[np.bool_]
-    diverged: NDArray[np.bool_]
-    latency_s: Array
-    network_s: Array
 
 
 def control(
@@ -112,20 +90,22 @@ def control(
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     disturbances = [np.random.default_rng((seed, 1)) for seed in seeds]
     low, high = envs[0].action_space.low, envs[0].action_space.high
-    log = _Log(controller, len(seeds), total, len(low))
+    log = Log(task, len(controller.g.parts), len(seeds), total)
     try:
         states = np.stack([task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)])
         log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
         alive, plans, since = np.arange(len(seeds)), np.empty((len(seeds), controller.horizon, states.shape[1])), 0
-        method = _Resumed(controller.method, controller.execute)
+        method, stuck = _Resumed(controller.method, controller.execute), np.zeros(len(seeds), dtype=bool)
         while log.done < total and len(alive):
             tau = log.done
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
                 method = _Resumed(controller.method, controller.execute, method.state if last is not None else None)
-                found = _plan(controller, method, states[alive], log.now(alive), last, [generators[i] for i in alive])
+                draws = _draws(controller, [generators[i] for i in alive])
+                found = _plan(controller, method, states[alive], log.now(alive), last, draws)
                 plans[alive] = found.x
-                log.plan(tau, alive, found)
+                log.plan(tau, alive, found.x, found.g, found.total_s, found.network_s)
+                stuck[alive] = found.missed
                 alive = log.end(log.diverged, alive, ~np.isfinite(found.x).all(axis=(1, 2)))
                 if not len(alive):
                     break
@@ -134,6 +114,9 @@ def control(
             if on_frame and alive[0] == 0:
                 on_frame(tau, envs[0], plans[0])
             inputs = u.double().cpu().numpy()
+            for row, i in enumerate(alive):
+                if stuck[i]:
+                    inputs[row], log.braked[i, tau] = cast(Any, controller.brake)(states[i]), 1.0
             fell, diverged = np.zeros(len(alive), dtype=bool), np.zeros(len(alive), dtype=bool)
             for row, i in enumerate(alive):
                 disturbance = controller.action_noise * disturbances[i].normal(size=len(low)) * (high - low) / 2
@@ -155,6 +138,36 @@ def control(
         for env in envs:
             env.close()
     return log.episodes()
+
+
+@dataclass(frozen=True)
+class _InUnits:
+    """The method on coordinates y = scale * z, which have the units of the environment: what is near is measured there. The scales
+    of z differ a hundredfold along the window, and a method on z would leave the first waypoints, which are all that is
+    executed, as they are. The reverse step is linear, so that it is the same step in y.
+
+    scale   [horizon, dim]
+    """
+
+    method: Method
+    scale: Tensor
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        return self.method.init(x, g)
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        scale = self.scale
+        y = Step(
+            x=scale * step.x,
+            x0=scale * step.x0,
+            beta=step.beta,
+            level=step.level,
+            reverse=lambda clean: scale * step.reverse(clean / scale),
+            pins=Pins(step.pins.mask, scale * step.pins.values),
+            last=step.last,
+        )
+        out, state = self.method.step(y, g, state)
+        return out / scale, state
 
 
 @dataclass
@@ -193,10 +206,13 @@ class _Resumed:
 
 @dataclass(frozen=True)
 class _Found:
-    """Plans of one control step: x [n, horizon, dim], the constraint they were scored by, times."""
+    """Plans of one control step: x [n, horizon, dim], the constraint they were scored by, whether they miss what they were to
+    obey [n], times.
+    """
 
     x: Array
     g: Constraint
+    missed: NDArray[np.bool_]
     total_s: float
     network_s: float
 
@@ -207,9 +223,36 @@ def _plan(
     states: Array,
     observed: Mapping[str, Array],
     last: Array | None,
-    generators: Sequence[torch.Generator],
+    draws: Tensor,
 ) -> _Found:
-    """Plans that begin at the states [n, dim]."""
+    """Plans that begin at the states [n, dim], by the noise draws [n, count, horizon, dim]. Where one of several cannot be, the
+    others are made without it; one that cannot be is to stay where it is, and missed.
+    """
+    try:
+        return _plan_together(controller, method, states, observed, last, draws)
+    except InfeasibleError:
+        if controller.brake is None:
+            raise
+    n, began, each = len(states), time.perf_counter(), []
+    scored = controller.g.bind({k: torch.from_numpy(v) for k, v in observed.items()}, controller.task.dt, controller.horizon)
+    if n == 1:
+        return _Found(states[:, None].repeat(controller.horizon, 1), scored, np.ones(1, dtype=bool), 0.0, 0.0)
+    for i in range(n):
+        one, before = slice(i, i + 1), None if last is None else last[i : i + 1]
+        seen = {name: values[one] for name, values in observed.items()}
+        each.append(_plan(controller, controller.method, states[one], seen, before, draws[one]))
+    x, missed = np.concatenate([found.x for found in each]), np.concatenate([found.missed for found in each])
+    return _Found(x, scored, missed, time.perf_counter() - began, sum(found.network_s for found in each))
+
+
+def _plan_together(
+    controller: Controller,
+    method: Method,
+    states: Array,
+    observed: Mapping[str, Array],
+    last: Array | None,
+    draws: Tensor,
+) -> _Found:
     device, horizon, network_s = controller.device, controller.horizon, 0.0
     synchronise(device)
     began = time.perf_counter()
@@ -229,115 +272,47 @@ def _plan(
         seen = {name: torch.from_numpy(values) for name, values in observed.items()}
         scored, obeyed = (g.bind(seen, controller.task.dt, horizon) for g in (controller.g, controller.enforced))
         like = torch.empty(0, device=device)
-        g = pull_back(obeyed, to.centre, to.scale).to(like)
+        unit = torch.ones_like(to.scale)
+        g = pull_back(obeyed, to.centre, unit).to(like)
         shape = (horizon, states.shape[1])
         mask = torch.zeros(shape, dtype=torch.bool, device=device)
         mask[0] = True
         begin = to.encode(here[:, None].expand(-1, horizon, -1))
         pins = Pins(mask, begin.to(like))
         schedule, first = controller.schedule, None
-        draws = iter(_draws(generators, schedule.n_steps + 1, shape, controller.temperature).to(device).unbind(1))
+        noise = iter(draws.to(device).unbind(1))
         if last is not None:
             steps = controller.calls - controller.extra_steps
             schedule = schedule.until(steps)
             moved = np.concatenate((last[:, controller.execute :], last[:, -1:].repeat(controller.execute, 1)), 1)
             a = schedule.alpha_bar[-1]
-            first = (a**0.5 * to.encode(torch.from_numpy(moved)).to(like)) + (1 - a) ** 0.5 * next(draws)
+            first = (a**0.5 * to.encode(torch.from_numpy(moved)).to(like)) + (1 - a) ** 0.5 * next(noise)
         z = sample(
             timed,
             schedule,
-            method,
+            _InUnits(method, to.scale.to(like)),
             g,
             pins,
-            lambda: next(draws),
+            lambda: next(noise),
             kernel=KERNELS[controller.kernel],
             extra_steps=controller.extra_steps,
             first=first,
         )
         z64 = z.double().cpu()
         if controller.polish:
-            g64 = pull_back(obeyed.tighten(MARGIN), to.centre, to.scale)
-            z64, _ = project_from(g64, z64, Pins(mask.cpu(), begin), None, 0)
+            g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
+            y, _ = project_from(g64, to.scale * z64, Pins(mask.cpu(), to.scale * begin), None, 0)
+            z64 = y / to.scale
         x = to.decode(z64).numpy()
         x[:, 0] = states
+        missed = np.zeros(len(x), dtype=bool)
+        if controller.polish and controller.brake is not None:
+            missed = (obeyed(torch.from_numpy(x)) > TOLERANCE).any(1).numpy()
     synchronise(device)
-    return _Found(x, scored, time.perf_counter() - began, network_s)
+    return _Found(x, scored, missed, time.perf_counter() - began, network_s)
 
 
-def _draws(generators: Sequence[torch.Generator], count: int, shape: tuple[int, int], temperature: float) -> torch.Tensor:
-    """Noise for a whole plan, one generator an episode [n, count, *shape]."""
-    return temperature * torch.stack([torch.randn((count, *shape), generator=generator) for generator in generators])
-
-
-class _Log:
-    """What happened so far, episode by episode."""
-
-    def __init__(self, controller: Controller, n: int, steps: int, inputs: int) -> None:
-        dim, parts = len(controller.task.layout), len(controller.g.parts)
-        self.controller, self.done = controller, 0
-        self.x, self.planned = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
-        self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
-        self.foreseen = np.full((n, steps + 1, parts), np.nan)
-        self.observed = {name: np.full((n, steps + 1), np.nan) for name in controller.task.observable}
-        self.violation = np.full((n, steps), np.nan)
-        self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-        self.info: dict[str, Array] = {}
-        self.latency: list[float] = []
-        self.network: list[float] = []
-
-    def now(self, which: NDArray[np.intp]) -> dict[str, Array]:
-        return {name: values[which, self.done] for name, values in self.observed.items()}
-
-    def observe(self, tau: int, states: Array, observed: Sequence[Mapping[str, float]], which: NDArray[np.intp]) -> None:
-        self.x[which, tau] = states
-        if tau == 0:
-            self.planned[which, 0] = states
-        for name, values in self.observed.items():
-            values[which, tau] = [each[name] for each in observed]
-
-    def plan(self, tau: int, which: NDArray[np.intp], found: _Found) -> None:
-        self.violation[which, tau] = found.g(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
-        self.latency.append(found.total_s)
-        self.network.append(found.network_s)
-        self.levels = [_levels(part, torch.from_numpy(found.x)) for part in found.g.parts]
-        self.rows = {int(i): row for row, i in enumerate(which)}
-
-    def end(self, flags: NDArray[np.bool_], which: NDArray[np.intp], ended: Any) -> NDArray[np.intp]:
-        """Those of `which` that go on; the others are flagged."""
-        flags[which[ended]] = True
-        return which[~ended]
-
-    def foresee(self, tau: int, states: Array, which: NDArray[np.intp], waypoint: int) -> None:
-        self.planned[which, tau] = states
-        rows = [self.rows[int(i)] for i in which]
-        for k, values in enumerate(self.levels):
-            self.foreseen[which, tau, k] = values[rows, waypoint]
-
-    def act(self, tau: int, i: int, u: Array, reward: float, info: Mapping[str, Any]) -> None:
-        self.u[i, tau], self.reward[i, tau] = u, reward
-        for name, value in info.items():
-            if isinstance(value, bool | int | float | np.number | np.bool_):
-                self.info.setdefault(name, np.full(self.reward.shape, np.nan))[i, tau] = float(value)
-
-    def episodes(self) -> Episodes:
-        return Episodes(
-            x=self.x,
-            u=self.u,
-            reward=self.reward,
-            planned=self.planned,
-            foreseen=self.foreseen,
-            observed=self.observed,
-            violation=self.violation,
-            info=self.info,
-            fell=self.fell,
-            diverged=self.diverged,
-            latency_s=np.array(self.latency),
-            network_s=np.array(self.network),
-        )
-
-
-def _levels(part: Any, x: torch.Tensor) -> Array:
-    """The part's level at every waypoint [n, horizon]; its rows' largest where it has none."""
-    level = getattr(part, "level", None)
-    values = part(x).amax(1, keepdim=True).expand(x.shape[:2]) if level is None else level(x)
-    return np.asarray(values.numpy())
+def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:
+    """Noise for a whole plan, one generator an episode [n, steps + 1, horizon, dim]."""
+    shape = (controller.schedule.n_steps + 1, controller.horizon, len(controller.task.layout))
+    return controller.temperature * torch.stack([torch.randn(shape, generator=generator) for generator in generators])

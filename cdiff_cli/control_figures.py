@@ -13,7 +13,8 @@ import torch
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 
-from cdiff_cli.control import Controller, Episodes
+from cdiff_cli.control import Controller
+from cdiff_cli.episodes import Episodes
 
 Array = NDArray[np.float64]
 UNSAFE, SAFE, FORESEEN = "#d1495b", "#1d4e89", "#9aa5b1"

@@ -3,8 +3,9 @@
 Every method is the plain step x_{t-1} = reverse(x0) with two holes: the clean estimate x0 may be changed before it, the
 sample after it. `on` says where g is evaluated and where the change is made:
 
-noisy   at x_t, the change made to x_{t-1}: the paper's
-clean   at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
+noisy     at x_t, the change made to x_{t-1}: the paper's
+estimate  at the clean estimate x0, the change made to x_{t-1}: ours for control; multipliers alone
+clean     at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
 
 What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
@@ -25,6 +26,7 @@ from cdiff_cli.projection import project_from
 from cdiff_cli.safediffuser import SafeDiffuser
 
 On = Literal["noisy", "clean"]
+DualOn = Literal["noisy", "estimate", "clean"]
 Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
 Correction = Literal["kernel", "latent"]
@@ -76,6 +78,7 @@ class PrimalDual:
 
     noisy:  x_{t-1} = reverse(x0) - c_t lam_t^T dg(x_t)               (paper, Eq. pri)
             lam_{t-1} = [lam_t + eta E g(x_t)]_+                      (paper, Eq. dual)
+    estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
     With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
@@ -87,7 +90,7 @@ class PrimalDual:
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
 
-    on: On = "clean"
+    on: DualOn = "clean"
     eta: float = 1.0
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
@@ -100,8 +103,8 @@ class PrimalDual:
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
-        if self.on == "noisy":
-            rows, pull, _ = linearise(g, step.x, self.positive)
+        if self.on != "clean":
+            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
@@ -128,6 +131,7 @@ class AugmentedLagrangian:
 
     s_t = [-E g - lam_t / rho_t]_+,  m = lam_t + rho_t (E g + s_t) = [lam_t + rho_t E g]_+
     noisy:  g at x_t,  x_{t-1} = reverse(x0) - c_t m^T dg(x_t)
+    estimate:  the same with g and dg at x0
     clean:  g at x0 - lam_t^T dg(x0), the estimate as the multipliers known so far push it;
             x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
     lam_{t-1} = m,  rho_{t-1} = c rho_t
@@ -142,7 +146,7 @@ class AugmentedLagrangian:
     coefficient, expectation, positive   as in PrimalDual
     """
 
-    on: On = "clean"
+    on: DualOn = "clean"
     rho: float = 0.5
     c: float = 1.02
     inner: int = 1
@@ -157,8 +161,8 @@ class AugmentedLagrangian:
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
         lam, rho, _ = state
-        if self.on == "noisy":
-            rows, pull, _ = linearise(g, step.x, self.positive)
+        if self.on != "clean":
+            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)

@@ -195,6 +195,7 @@ def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -
             "violation_rate": 100.0 * float((worst > SAFE).sum()) / max(int(count) + 1, 1),
             "fell": float(episodes.fell[i]),
             "diverged": float(episodes.diverged[i]),
+            "braked": 100.0 * float(episodes.braked[i, :count].mean()) if count else 0.0,
             "saturation": 100.0 * float(saturated[i, :count].mean()) if count else math.nan,
             "steps": float(count),
             "latency_ms": 1e3 * float(np.median(episodes.latency_s)),

@@ -10,9 +10,10 @@ import torch
 
 from cdiff_cli import metrics
 from cdiff_cli.constraint import Constraint, Waypoints
-from cdiff_cli.control import Controller, Episodes, control
+from cdiff_cli.control import Controller, control
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import Schedule
+from cdiff_cli.episodes import Episodes
 from cdiff_cli.frames import Frame
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import Projected, Unconstrained
@@ -207,3 +208,15 @@ def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
     done = control(replace(FREE, method=Projected(), polish=True, g=held, enforced=held), [0], steps=5)
     assert done.x[0, 0, 1] > 0.01
     assert done.x[0, 1:, 1].max() <= 0.01 + 1e-5
+
+
+def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
+    """Two bounds that exclude each other; the brake takes a tenth of the speed."""
+    narrow = (Waypoints("low", Affine(vec(0.0, 1.0), torch.tensor(0.2, dtype=F64))),)
+    narrow += (Waypoints("high", Affine(vec(0.0, -1.0), torch.tensor(-0.4, dtype=F64))),)
+    never = Constraint(narrow)
+    acting = replace(FREE, method=Projected(), polish=True, g=never, enforced=never, brake=lambda x: -x[1:])
+    done = control(acting, [0], steps=5)
+    assert (done.braked == 1).all()
+    np.testing.assert_allclose(done.x[0, 1:, 1], 0.9 * done.x[0, :-1, 1], atol=1e-6)
+    assert (control(replace(acting, enforced=LIMIT), [0], steps=5).braked == 0).all()

@@ -4,9 +4,9 @@ Each iteration tries the policy perturbed by +nu d and -nu d along N random dire
 largest of their two returns, and steps by alpha / (b sigma) * sum (return+ - return-) d, sigma the standard deviation of
 the 2 b returns. Observations are whitened by their running mean and deviation, which the result folds into W and b.
 
-A seed is searched without noise first, then, whitening frozen, under action noise, so that the gait does not fall when it
-is executed imprecisely. Of the policies on the way the one best on the selection seeds is kept; the returns written down
-are of other seeds.
+A seed is searched without noise first; then, whitening frozen, under action noise; then, whitened anew by its own walk,
+under more, so that the gait does not fall where it is executed imprecisely. Each phase starts from the policy that was best
+on the selection seeds in the one before; the returns written down are of other seeds.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,17 +32,33 @@ SELECTION = range(10_000, 10_018)
 TEST = range(20_000, 20_020)
 
 
+class Phase(NamedTuple):
+    """One stretch of a search under noise.
+
+    until       environment steps at its end, since the whitening was last begun
+    noise       standard deviations of the action noise, direction by direction in turn
+    selection   those of the selection episodes, in turn
+    episodes    how many of these
+    whiten      whether to begin a new whitening, of the gait's own states
+    """
+
+    until: int
+    noise: tuple[float, ...]
+    selection: tuple[float, ...]
+    episodes: int
+    whiten: bool = False
+
+
 @dataclass(frozen=True)
 class Search:
     """Constants of the search of one task.
 
     directions, best, alpha, nu   N, b, step size and size of the perturbations
     survival                      taken off the reward of a step: else standing still pays
-    steps                         environment steps of a seed, all in all
-    screen, at_least              the share of them after which a seed below that return is given up
-    robust                        the share of them searched under noise
-    noise                         its standard deviations, direction by direction in turn
-    selection, test               those a robust gait is selected under, and those the returns written down are under
+    screen, at_least              a seed that has not reached this return by so many steps is given up
+    quiet                         the phase without noise, in which observations are whitened
+    noisy                         the phases after it
+    test                          standard deviations of the action noise the returns written down are under
     """
 
     directions: int
@@ -50,18 +66,49 @@ class Search:
     alpha: float
     nu: float
     survival: float
-    steps: int
-    screen: float
+    screen: int
     at_least: float
-    robust: float
-    noise: tuple[float, ...]
-    selection: tuple[float, ...]
+    quiet: Phase
+    noisy: tuple[Phase, ...]
     test: tuple[float, ...]
+
+    def within(self, steps: int) -> "Search":
+        """The same search in that many steps altogether."""
+        begun = [i for i, phase in enumerate(self.noisy) if phase.whiten]
+        ends = [(self.quiet, *self.noisy)[i].until for i in begun] + [(self.quiet, *self.noisy)[-1].until]
+        share = steps / sum(ends)
+        shorter = [phase._replace(until=round(phase.until * share)) for phase in (self.quiet, *self.noisy)]
+        return replace(self, screen=round(self.screen * share), quiet=shorter[0], noisy=tuple(shorter[1:]))
 
 
 SEARCHES = {
-    "hopper": Search(8, 4, 0.01, 0.025, 1.0, 4_000_000, 0.05, 500.0, 0.5, (0.2, 0.1), (0.0, 0.1, 0.15), (0.0, 0.05, 0.1)),
-    "swimmer": Search(4, 4, 0.05, 0.1, 0.0, 1_200_000, 0.25, 150.0, 0.0, (), (0.0,), (0.0, 0.1, 0.3)),
+    "hopper": Search(
+        directions=8,
+        best=4,
+        alpha=0.01,
+        nu=0.025,
+        survival=1.0,
+        screen=600_000,
+        at_least=1000.0,
+        quiet=Phase(2_200_000, (0.0,), (0.0,), 12),
+        noisy=(
+            Phase(4_000_000, (0.15, 0.05), (0.0, 0.05, 0.1), 12),
+            Phase(1_000_000, (0.2, 0.1), (0.0, 0.1, 0.15), 18, whiten=True),
+        ),
+        test=(0.0, 0.05, 0.1),
+    ),
+    "swimmer": Search(
+        directions=4,
+        best=4,
+        alpha=0.05,
+        nu=0.1,
+        survival=0.0,
+        screen=300_000,
+        at_least=150.0,
+        quiet=Phase(1_200_000, (0.0,), (0.0,), 18),
+        noisy=(),
+        test=(0.0, 0.1, 0.3),
+    ),
 }
 
 
@@ -98,20 +145,36 @@ class Climb:
         self.rng = np.random.default_rng(seed)
         self.M = np.zeros((len(task.actions), len(task.layout)))
         self.whitening = Whitening(len(task.layout))
-        self.steps = 0
+        self.steps, self.before = 0, 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Let the present policy be the best so far."""
         self.best, self.best_score = self.whitening.fold(self.M, 4), -np.inf
         self.best_state = self.M, copy.copy(self.whitening)
 
-    def run(self, until: int, noise: Sequence[float], test: Sequence[float], learn: bool, report: Report) -> None:
-        """Iterations up to that number of steps, the policy tested every tenth of the way."""
+    def whiten(self, seed: int) -> None:
+        """Start from the best gait with the deviations of its own states and a mean that gives its b back."""
+        seen: list[Array] = []
+        for episode in range(10):
+            self.task.walk(self.env, self.best, episode, 0.05, seen)
+        self.whitening = Whitening(len(self.task.layout))
+        self.whitening.add(np.array(seen))
+        self.whitening.mean = -np.linalg.pinv(self.best.W) @ self.best.b
+        self.M = self.best.W * self.whitening.deviation()
+        self.rng = np.random.default_rng(seed)
+        self.before, self.steps = self.before + self.steps, 0
+
+    def run(self, phase: Phase, learn: bool, report: Report) -> None:
+        """Iterations up to the phase's end, the policy tested every tenth of the way."""
         first, tested = self.steps, 0
-        while self.steps < until:
-            self._iterate(noise, learn)
-            tenth = 10 * (self.steps - first) // max(until - first, 1)
+        while self.steps < phase.until:
+            self._iterate(phase.noise, learn)
+            tenth = 10 * (self.steps - first) // max(phase.until - first, 1)
             if tenth > tested:
                 tested = tenth
-                score = self.test(test)
-                report(f"{self.steps} steps: return {score:.1f}, best {self.best_score:.1f}")
+                score = self.test(phase.selection, phase.episodes)
+                report(f"{self.before + self.steps} steps: return {score:.1f}, best {self.best_score:.1f}")
 
     def _iterate(self, noise: Sequence[float], learn: bool) -> None:
         s = self.search
@@ -133,28 +196,32 @@ class Climb:
         if learn:
             self.whitening.add(np.array(seen))
 
-    def test(self, noise: Sequence[float]) -> float:
-        """Mean return of the rounded policy over the selection seeds, the noise in turn; the best is remembered."""
+    def test(self, noise: Sequence[float], episodes: int) -> float:
+        """Mean return of the rounded policy over selection episodes, the noise in turn; the best is remembered."""
         gait = self.whitening.fold(self.M, 4)
-        outs = [self.task.walk(self.env, gait, seed, noise[i % len(noise)]) for i, seed in enumerate(SELECTION)]
+        outs = [self.task.walk(self.env, gait, seed, noise[i % len(noise)]) for i, seed in enumerate(SELECTION[:episodes])]
         self.steps += sum(out.steps for out in outs)
         score = float(np.mean([out.reward for out in outs]))
         if score > self.best_score:
-            self.best, self.best_score, self.best_state = gait, score, (self.M, copy.copy(self.whitening))
+            self.best, self.best_score = gait, score
+            self.best_state = self.M, copy.copy(self.whitening)
         return score
 
 
 def search_gait(task: Locomotion, search: Search, seed: int, report: Report = lambda _: None) -> tuple[Gait, int] | None:
     """The gait of a seed and the environment steps it took, or None where the seed was given up."""
     climb = Climb(task, search, seed)
-    climb.run(int(search.screen * search.steps), (0.0,), (0.0,), True, report)
+    climb.run(search.quiet._replace(until=search.screen), True, report)
     if climb.best_score < search.at_least:
         return None
-    climb.run(int((1 - search.robust) * search.steps), (0.0,), (0.0,), True, report)
-    if search.robust:
-        (climb.M, climb.whitening), climb.best_score = climb.best_state, -np.inf
-        climb.run(search.steps, search.noise, search.selection, False, report)
-    return climb.best, climb.steps
+    climb.run(search.quiet, True, report)
+    for phase in search.noisy:
+        climb.M, climb.whitening = climb.best_state
+        if phase.whiten:
+            climb.whiten(seed + 100)
+        climb.forget()
+        climb.run(phase, False, report)
+    return climb.best, climb.before + climb.steps
 
 
 def measure(task: Locomotion, gait: Gait, noise: float, seeds: Sequence[int] = TEST) -> dict[str, float]:
@@ -187,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     task, search = load_task(asked.task), SEARCHES[asked.task]
     if asked.steps:
-        search = replace(search, steps=asked.steps)
+        search = search.within(asked.steps)
     out = asked.out or home() / "models" / task.name / "expert.json"
     policies = []
     for seed in asked.seed:

@@ -1,0 +1,94 @@
+"""What each choice of the ball run's recommended preset is worth: one row a change, the same episodes and noise for all.
+
+    python tests/benchmarks/control_ablation.py [--episodes 60] [--seed 0]
+
+A ghost obstacle in all six patterns. Violations are executed states within 1.2 m of the obstacle's centre.
+"""
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from cdiff_cli import metrics
+from cdiff_cli.closed_loop import controller
+from cdiff_cli.control import control
+from cdiff_cli.recipe import home
+from cdiff_cli.request import Options, resolve
+
+RATE = {"time": 0.2, "velocity": {"x": "vx", "y": "vy"}}
+PLACE = RATE | {"form": "place"}
+ROWS = [
+    ("diffuser, no constraint", "diffuser", {}, ()),
+    ("recommended alm", "alm", {}, ()),
+    ("g at the noisy sample", "alm", {}, ("on=noisy",)),
+    ("clean estimate changed", "alm", {}, ("on=clean", "rho=0.5", "c=1.2")),
+    ("projected", "projected", {}, ()),
+    ("primal-dual", "primal-dual", {}, ()),
+    ("obstacle held in place", "alm", {"hold": True}, ()),
+    ("plain barrier h", "alm", {"look_ahead": None}, ()),
+    ("plain barrier, squared form", "alm", {"look_ahead": None, "form": "squared"}, ()),
+    ("look-ahead to the place", "alm", {"look_ahead": PLACE}, ()),
+    ("order 2 in positions", "alm", {"look_ahead": None, "order": 2}, ()),
+    ("look-ahead 0.1 s", "alm", {"look_ahead": RATE | {"time": 0.1}}, ()),
+    ("look-ahead 0.4 s", "alm", {"look_ahead": RATE | {"time": 0.4}}, ()),
+    *((f"alpha {alpha:g}", "alm", {"alpha": alpha}, ()) for alpha in (0.1, 0.3, 0.85, 1.0)),
+    *((f"rho {rho:g}", "alm", {}, (f"rho={rho}",)) for rho in (1.0, 3.0, 30.0)),
+]
+
+
+def varied(change: dict, folder: Path) -> Path:
+    """The shipped constraint file with its one barrier changed."""
+    content = yaml.safe_load((home() / "constraints" / "ball-run.yaml").read_text())
+    (barrier,) = content["constraints"]
+    for key, value in change.items():
+        if key == "form":
+            barrier["barrier"]["form"] = value
+        elif value is None:
+            barrier.pop(key)
+        else:
+            barrier[key] = value
+    path = folder / "ball-run.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds = range(asked.seed, asked.seed + asked.episodes)
+    table = Table(title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}")
+    for title in ("change", "return", "violation rate / %", "episodes violating", "worst / m", "saturation / %"):
+        table.add_column(title, justify="left" if title == "change" else "right")
+    truth = resolve(Options(task="ball-run")).problem.g
+    for name, method, change, settings in ROWS:
+        with tempfile.TemporaryDirectory() as folder:
+            path = varied(change, Path(folder))
+            acting = controller(resolve(Options(task="ball-run", method=method, constraints=path, settings=settings, margin=0.0)))
+        done = control(replace(acting, polish=False) if "squared" in name else acting, seeds, {"collide": False})
+        levels = metrics.executed_levels(truth, done.x, done.observed, acting.task.dt)
+        rows = metrics.control_metrics(done, levels, (-np.ones(2), np.ones(2)))
+        reward = np.array([row["reward"] for row in rows])
+        table.add_row(
+            name,
+            f"{reward.mean():.0f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.0f}",
+            f"{np.mean([row['violation_rate'] for row in rows]):.3f}",
+            f"{sum(row['safe_executed'] == 0 for row in rows)}",
+            f"{max(row['executed_worst'] for row in rows):.3f}",
+            f"{np.mean([row['saturation'] for row in rows]):.1f}",
+        )
+        Console(stderr=True).print(name, rows and f"{reward.mean():.0f}")
+    Console(width=130).print(table)
+
+
+if __name__ == "__main__":
+    main()
