@@ -235,7 +235,7 @@ def test_make_method_reads_numbers_written_as_strings():
         ("zzz", {}, 'no method "zzz"; choose from diffuser'),
         ("alm", {"rhoo": 1}, 'alm has no setting "rhoo".*did you mean "rho"'),
         ("diffuser", {"eta": 1}, "its settings are: none"),
-        ("alm", {"on": "Noisy"}, "alm.on: expected one of noisy, clean, found 'Noisy'"),
+        ("alm", {"on": "Noisy"}, "alm.on: expected one of noisy, estimate, clean, found 'Noisy'"),
         ("primal-dual", {"eta": "much"}, "primal-dual.eta: expected a number, found 'much'"),
         ("primal-dual", {"eta": None}, "expected a number"),
         ("primal-dual", {"eta": -1}, "expected a positive number"),

@@ -110,8 +110,9 @@ def test_description_states_the_inequality(entry, tmp_path):
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_constraints_load(path):
     name = next(task for task in sorted(TASKS, key=len, reverse=True) if path.stem.startswith(task))
-    layout = load_task(name).layout
-    kinds, g = load_constraints(path, name, layout)
+    layout, observable = load_task(name).layout, getattr(load_task(name), "observable", ())
+    kinds, g = load_constraints(path, name, layout, None, observable)
+    g = g.bind({quantity: torch.ones(2, dtype=torch.float64) for quantity in observable}, 0.1, 3)
     assert kinds
     values = g(torch.zeros(2, 3, len(layout), dtype=torch.float64))
     assert values.shape == (2, len(g.labels(3)))

@@ -16,6 +16,7 @@ from cdiff_cli.checkpoint import Checkpoint, card_path, install, load_checkpoint
 from cdiff_cli.config import load
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.recipe import Card, DemonstrationSpec, NetworkSpec, Recipe, TrainSpec, load_recipe
+from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.maze2d import UMAZE
 from cdiff_cli.training import choose_device, data_statistics, end_pins, train
 
@@ -311,12 +312,13 @@ def test_shipped_checkpoint_loads_is_small_and_its_card_holds(path):
     assert checkpoint.card.weights_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert (checkpoint.card.horizon, checkpoint.card.n_steps) == (own.horizon, own.n_steps)
     assert checkpoint.card.network == own.train["small"].network
-    assert checkpoint.demonstrations.shape[1:] == (own.horizon, 4)
+    assert checkpoint.demonstrations.shape[1:] == (own.horizon, len(load_task(path.parent.name).layout))
     assert all(p.isfinite().all() for p in checkpoint.net.parameters())
 
 
-def test_checkpoints_are_shipped_for_both_mazes():
-    assert [path.parent.name for path in SHIPPED] == ["maze2d-large", "maze2d-umaze"]
+def test_checkpoints_are_shipped_for_every_task_that_is_trained():
+    trained = sorted(path.parent.name for path in MODELS.glob("*/recipe.yaml") if load(path, Recipe).train)
+    assert [path.parent.name for path in SHIPPED] == trained
 
 
 def test_the_commit_is_none_without_git(monkeypatch):
