@@ -63,11 +63,15 @@ def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
 
 
 def errors(foreseen: Array, executed: Array) -> Array:
-    """Largest amount by which execution was less safe than the plan followed had foreseen, an episode and part [n, parts]:
-    max over steps of f(x^tau) - f(planned x^tau), f > 0 unsafe.
+    """Largest amount by which execution was less safe than the plan followed had foreseen, an episode and part [n, parts]: max over
+    steps of f(x^tau) - f(planned x^tau), f > 0 unsafe, among the steps that such an error could make unsafe: those planned no
+    further from the limit than the largest error of all. What happens further off needs no margin.
+
+    foreseen, executed   f at the states, NaN after an episode's end   [n, steps + 1, parts]
     """
-    gap = np.nan_to_num(executed - foreseen, nan=-np.inf)
-    return np.asarray(gap[:, 1:].max(1))
+    gap = np.nan_to_num((executed - foreseen)[:, 1:], nan=-np.inf)
+    largest = gap.max((0, 1))
+    return np.asarray(np.where(-foreseen[:, 1:] <= largest, gap, 0.0).max(1))
 
 
 def conformal(scores: Array, level: float) -> float:
