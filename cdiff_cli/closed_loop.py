@@ -136,9 +136,10 @@ def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:
 def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -> list[Row]:
     space = acting.task.make_env().action_space
     measured = metrics.control_metrics(done, levels, (space.low.astype(float), space.high.astype(float)))
-    env = {"env": " ".join(resolved.options.env)} if resolved.options.env else {}
+    told = resolved.row()
+    told["constraints"] = " ".join((told["constraints"], *resolved.options.env))  # what was met is part of what was asked
     return [
-        resolved.row() | env | {"seed": seed} | values | {"calls": acting.calls * resolved.calls_a_step}
+        told | {"seed": seed} | values | {"calls": acting.calls * resolved.calls_a_step}
         for seed, values in zip(resolved.seeds, measured, strict=True)
     ]
 

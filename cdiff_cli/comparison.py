@@ -12,7 +12,17 @@ from cdiff_cli import tables
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.inference import Test
 from cdiff_cli.recipe import home
-from cdiff_cli.runs import PAPER_TABLE, PLAN_TABLE, ROLLOUT_TABLE, SAFETY_TABLE, Row, compare, differences, merge_kinds
+from cdiff_cli.runs import (
+    CONTROL_TABLE,
+    PAPER_TABLE,
+    PLAN_TABLE,
+    ROLLOUT_TABLE,
+    SAFETY_TABLE,
+    Row,
+    compare,
+    differences,
+    merge_kinds,
+)
 
 TESTS = {"wilcoxon": "Wilcoxon's signed ranks (McNemar's test of rates)", "t": "Student's t (McNemar's test of rates)"}
 MARKS = {"latex": "% ", "markdown": "- "}
@@ -34,19 +44,22 @@ def print_comparison(
         raise CdiffError(f'--against: no runs of "{against}"{suggestion(against, methods)} here; there are {known}')
     values = tables.read_paper(home() / "runs" / "reference" / "paper.csv") if paper else None
     objects: dict[str, Any] = {}
+    acted = [row for row in rollouts if "plan_violation" in row]
+    followed = [row for row in rollouts if "plan_violation" not in row]
     for title, rows, table in (
         ("plans", plans, PAPER_TABLE if paper else PLAN_TABLE),
-        ("rollouts", rollouts, tuple(dict.fromkeys((*SAFETY_TABLE, *ROLLOUT_TABLE)))),
+        ("rollouts", followed, tuple(dict.fromkeys((*SAFETY_TABLE, *ROLLOUT_TABLE)))),
+        ("closed loop", acted, CONTROL_TABLE),
     ):
         if not rows:
             continue
-        groups, beside = compare(rows, intervals=intervals), values if title == "plans" or style == "json" else None
+        groups, beside = compare(rows, intervals=intervals), values if title != "rollouts" or style == "json" else None
         shown = [(title, tables.render(groups, table, style, beside, title))]
         if against is not None:
             heading = f"{title} against {against}"
             found = differences(rows, against, table, test)
             shown.append((heading, tables.render_differences(found, style, f"{heading}: {TESTS[test]}, paired by seed")))
-        said = tables.notes(groups, table) if paper and title == "plans" else []
+        said = tables.notes(groups, table) if paper and title != "rollouts" else []
         if style == "json":
             objects |= {name: json.loads(text) for name, text in shown} | ({"notes": said} if said else {})
         else:

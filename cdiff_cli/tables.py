@@ -77,6 +77,8 @@ PAPER_NOTES = {
     "distance_paper": "distance (paper): to the mean unconstrained plan, as released; distance / m is to that of the same noise",
     "violation_paper": "violation (paper): at the waypoints, in the paper's units; a plan can be unsafe between them all the same",
     "step_ms": "step / ms: wall time of the whole batch over its network calls; the paper's: a diffusion step, RTX 4060",
+    "reward": "return: the paper's experts are others, and its ball run's obstacle is not described",
+    "plan_violation": "plan violation: mean over the plans of an episode, in rad/s or m; the paper does not say its units",
     "guidance": "guidance: what the released maze code calls Conditional, a push of constant weight on the unconditional planner",
     "conditional": "conditional: our planner, trained on with labels of this constraint file; two network calls a step",
     "safediffuser": "safediffuser: RoS unless set otherwise, rows from the compiled g; the paper does not say which variant it ran",

@@ -1,0 +1,101 @@
+"""What a control step costs: planning at batch 1, method by method, against the bare network calls of the same run.
+
+    python tests/benchmarks/control_step.py [--task hopper swimmer ball-run] [--steps 150] [--repeats 3] [--threads 2]
+
+Medians over the steps of an episode, after 10 to warm up; the methods take turns, so that a slow moment meets all of them. The
+last rows: the projection of one plan onto the task's barrier chain, ours and ProxQP's through qpsolvers.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import qpsolvers
+import torch
+from rich.console import Console
+from rich.table import Table
+from scipy import sparse
+
+from cdiff_cli.closed_loop import controller
+from cdiff_cli.constraint import Pins, pull_back
+from cdiff_cli.control import Controller, control
+from cdiff_cli.projection import project_from
+from cdiff_cli.request import Options, resolve
+
+WARM_UP = 10
+METHODS = ("diffuser", "projected", "primal-dual", "alm")
+
+
+def median_ms(call: Callable[[], Any], repeats: int = 200) -> float:
+    times = []
+    for k in range(repeats + 20):
+        began = time.perf_counter()
+        call()
+        if k >= 20:
+            times.append(time.perf_counter() - began)
+    return 1e3 * statistics.median(times)
+
+
+def projections(acting: Controller) -> tuple[float, float, float]:
+    """Milliseconds of one projection of a random plan near the data onto the first chain: ours, ProxQP's; their distance."""
+    frame, dim = acting.frame, len(acting.task.layout)
+    seen = {name: torch.ones(1, dtype=torch.float64) for name in acting.task.observable}
+    generator = torch.Generator().manual_seed(0)
+    present = frame.state.decode(torch.randn(1, dim, generator=generator, dtype=torch.float64))
+    to = frame.at(present)
+    g = pull_back(acting.g.bind(seen, acting.task.dt, acting.horizon), to.centre, torch.ones_like(to.scale))
+    g = type(g)(g.parts[:1])
+    y = to.scale * torch.randn(1, acting.horizon, dim, generator=generator, dtype=torch.float64)
+    y[:, 0] = 0
+    mask = torch.zeros(acting.horizon, dim, dtype=torch.bool)
+    mask[0] = True
+    pins = Pins(mask, y)
+    ours, _ = project_from(g, y, pins, None, 0)
+    rows, pull, _ = g.linearise(ours)
+    jacobian = torch.stack([pull(w[None])[0] for w in torch.eye(rows.shape[1], dtype=torch.float64)]).flatten(1).numpy()[:, dim:]
+    bound = jacobian @ ours.flatten()[dim:].numpy() - rows[0].numpy()
+    eye, target, J = sparse.eye(len(bound) * dim, format="csc"), -y.flatten()[dim:].numpy(), sparse.csc_matrix(jacobian)
+
+    def proxqp() -> Any:
+        return qpsolvers.solve_qp(eye, target, J, bound, solver="proxqp", eps_abs=1e-9)
+
+    gap = float(np.abs(proxqp() - ours.flatten()[dim:].numpy()).max())
+    return median_ms(lambda: project_from(g, y, pins, None, 0)), median_ms(proxqp), gap
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", nargs="+", default=["hopper", "swimmer", "ball-run"])
+    parser.add_argument("--steps", type=int, default=150)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    asked = parser.parse_args()
+    torch.set_num_threads(asked.threads)
+    table = Table(title=f"a control step at batch 1, {asked.threads} threads, milliseconds")
+    for title in ("task", "preset", "method", "calls", "network", "step", "95 %", "over the calls / %", "ProxQP"):
+        table.add_column(title, justify="left" if title in ("task", "preset", "method") else "right")
+    for task in asked.task:
+        for preset in ("recommended", "fast"):
+            each = {m: controller(resolve(Options(task=task, method=m, preset=preset))) for m in METHODS}
+            found: dict[str, list[Any]] = {m: [] for m in METHODS}
+            for _ in range(asked.repeats):
+                for method, acting in each.items():
+                    found[method].append(control(acting, [100], steps=asked.steps))
+            for method, runs in found.items():
+                step = 1e3 * np.concatenate([done.latency_s[WARM_UP:] for done in runs])
+                network = 1e3 * np.concatenate([done.network_s[WARM_UP:] for done in runs])
+                middle, calls = np.median(step), np.median(network)
+                share = f"{100 * (middle / calls - 1):.0f}"
+                numbers = (f"{calls:.2f}", f"{middle:.2f}", f"{np.quantile(step, 0.95):.2f}", share)
+                table.add_row(task, preset, method, str(each[method].calls), *numbers, "")
+        ours, theirs, gap = projections(replace(each["alm"]))
+        table.add_row(task, "", f"one projection (apart {gap:.0e})", "", "", f"{ours:.3f}", "", "", f"{theirs:.3f}")
+    Console(width=140).print(table)
+
+
+if __name__ == "__main__":
+    main()
