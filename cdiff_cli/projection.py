@@ -27,7 +27,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.segments import nearest_in_planes, planes
+from cdiff_cli.segments import goes_round, nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
@@ -138,10 +138,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
 
 def tangible(part: Part) -> bool:
     """Whether planes tangent to the part's surface, a few a waypoint, make a convex part of its set (segments.py)."""
-    level = getattr(part, "level", None)
-    return (isinstance(part, Waypoints) and isinstance(level, Affine)) or (
-        isinstance(part, Segments) and isinstance(level, Ellipsoid) and level.side > 0
-    )
+    return (isinstance(part, Waypoints) and isinstance(part.level, Affine)) or goes_round(part)
 
 
 def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:

@@ -7,11 +7,12 @@ the normals turning evenly from where it enters to where it leaves: a push strai
 """
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
-from cdiff_cli.constraint import Pins, Segments, Traj, Waypoints
+from cdiff_cli.constraint import Constraint, Part, Pins, Segments, Traj, Waypoints
 from cdiff_cli.levels import Affine, Ellipsoid, dot, each_end
 
 Planes = tuple[Tensor, Tensor]
@@ -39,6 +40,29 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
         a, b = _tangent(n, level, *first)  # of the segment after
         each.append((torch.cat((a, zero), 1), torch.cat((b, never), 1)))
     return torch.stack([a for a, _ in each], 2), torch.stack([b for _, b in each], 2)
+
+
+def goes_round(part: Part) -> TypeGuard[Segments]:
+    """Whether the part keeps segments outside a ball or an ellipsoid, so that tangent planes stand for it."""
+    return isinstance(part, Segments) and isinstance(part.level, Ellipsoid) and part.level.side > 0
+
+
+def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint:
+    """g with each part that goes round a ball replaced by two: the half-spaces of its tangent planes at x, of the segment before
+    each waypoint and of the segment after. One row a waypoint, in the part's own units; -1 where there is no such segment.
+    """
+    parts: list[Part] = []
+    for part in g.parts:
+        if not goes_round(part):
+            parts.append(part)
+            continue
+        a, b = planes((part,), x, pins)
+        assert isinstance(part.level, Ellipsoid)
+        m = part.level.m.expand(x.shape[:2])
+        for slot in range(a.shape[2]):
+            bound = torch.where(b[..., slot] == NEVER, 1.0, m * b[..., slot])
+            parts.append(Waypoints(part.name, Affine(m[..., None] * a[..., slot, :], bound)))
+    return Constraint(tuple(parts))
 
 
 def _tangent(n: Tensor, level: Ellipsoid, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:

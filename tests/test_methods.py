@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Pins
+from cdiff_cli.constraint import Constraint, Pins, Segments
 from cdiff_cli.diffusion import Noise, Schedule, Step, sample
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
@@ -171,6 +171,26 @@ def test_clean_methods_end_on_the_half_space(method, extra_steps, most):
 
 
 @pytest.mark.parametrize("method", [PrimalDual(), AugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"])
+def _through_a_disc(method, offset=0.02, horizon=96):
+    """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
+    s = torch.linspace(-2, 2, horizon, dtype=F64)
+    line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
+    g = Constraint((Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    noise = draws(11, 1, horizon, 2)
+    return sample(gaussian_denoiser(SCHEDULE, line, 1e-3), SCHEDULE, method, g, pin(line, 0, -1), noise, extra_steps=20), g
+
+
+@pytest.mark.parametrize(
+    "method",
+    [Projected(), PrimalDual(), AugmentedLagrangian(), AugmentedLagrangian(inner=3)],
+    ids=["projected", "primal-dual", "alm", "alm inner"],
+)
+def test_clean_methods_go_round_a_disc_without_tearing(method):
+    x, g = _through_a_disc(method)
+    assert float(x[0].diff(dim=0).norm(dim=-1).max()) <= 4 * 4 / 95  # an even line stretches to about thrice
+    assert float(g(x).max()) <= 1e-2  # the multipliers are still settling; radius 0.5
+
+
 def test_clean_duals_do_not_move_plans_that_are_safe_already(method):
     g = waypoints(half_space(b=50.0))
     assert torch.equal(_plan(method, g), _plan(Unconstrained(), g))
