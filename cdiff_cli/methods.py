@@ -7,6 +7,9 @@ noisy     at x_t, the change made to x_{t-1}: the paper's
 estimate  at the clean estimate x0, the change made to x_{t-1}: ours for control; multipliers alone
 clean     at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
 
+Of the dual methods on the last two, the rows of segments round a ball are those of tangent planes at x0 that turn evenly along the
+path (segments.py), which keep their places from step to step: g's own push each segment straight out, and so tear the plan.
+
 What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
 

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Constraint, Pins, Segments
+from cdiff_cli.constraint import Constraint, Pins, Segments, Waypoints
 from cdiff_cli.diffusion import Noise, Schedule, Step, sample
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
@@ -170,7 +170,6 @@ def test_clean_methods_end_on_the_half_space(method, extra_steps, most):
     assert float(g(_plan(method, g, extra_steps=extra_steps)).max()) <= most
 
 
-@pytest.mark.parametrize("method", [PrimalDual(), AugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"])
 def _through_a_disc(method, offset=0.02, horizon=96):
     """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
     s = torch.linspace(-2, 2, horizon, dtype=F64)
@@ -191,6 +190,25 @@ def test_clean_methods_go_round_a_disc_without_tearing(method):
     assert float(g(x).max()) <= 1e-2  # the multipliers are still settling; radius 0.5
 
 
+@pytest.mark.parametrize("on", ["noisy", "estimate", "clean"])
+@pytest.mark.parametrize("expectation", ["per_sample", "batch_mean"])
+@pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])
+def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expectation):
+    x = torch.linspace(-1, 1, 12, dtype=F64)[None, :, None] + 0.1 * normal(8, 3, 12, 2)
+    g = Constraint((Waypoints("wall", half_space()), Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5))))
+    method, pins = kind(on=on, expectation=expectation), pin(x, 0, -1)
+    state, sizes = method.init(x, g), set()
+    for _ in range(4):
+        sizes.add(getattr(state, "lam", state).shape)
+        out, state = method.step(_step(x, pins=pins), g, state)
+    plans = 1 if expectation == "batch_mean" else 3
+    assert sizes == {(plans, 12 + 11 if on == "noisy" else 12 + 2 * 12)}  # g's own rows: the paper's
+    assert bool(getattr(state, "lam", state).isfinite().all())
+    assert torch.equal(out[:, [0, -1]], x[:, [0, -1]])
+    assert not torch.equal(out, x)
+
+
+@pytest.mark.parametrize("method", [PrimalDual(), AugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"])
 def test_clean_duals_do_not_move_plans_that_are_safe_already(method):
     g = waypoints(half_space(b=50.0))
     assert torch.equal(_plan(method, g), _plan(Unconstrained(), g))
