@@ -89,7 +89,8 @@ def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
     n = _unit(near, first)
     inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-4)  # well above the rounding of a safe path
     if bool(inside.any()):
-        n = torch.where(inside[..., None], _turning(y, near, distance, inside), n)
+        n = n.clone()
+        n[inside] = _turning(y, near, distance, inside)
     return _tangent_to_pins(n, y, pinned)
 
 
@@ -135,7 +136,7 @@ def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
 
 
 def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tensor:
-    """Normals along runs of segments inside the sphere, as normals() describes [batch, n, k]."""
+    """Normals of the segments inside the sphere, along their runs, as normals() describes [segments inside, k]."""
     n = inside.shape[1]
     index = torch.arange(n, device=y.device).expand_as(inside)
     start = torch.where(inside, -1, index).cummax(1).values + 1  # first segment of the run
@@ -144,19 +145,18 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tenso
     deepest = torch.full_like(distance, torch.inf).scatter_reduce(1, run, torch.where(inside, distance, torch.inf), "amin")
     is_deepest = inside & (distance <= deepest.gather(1, run))
     middle = torch.full_like(index, n).scatter_reduce(1, run, torch.where(is_deepest, index, n), "amin").gather(1, run)
-    stop, middle = stop.clamp_min(0), middle.clamp_max(n - 1)
 
-    def at(points: Tensor, which: Tensor) -> Tensor:
-        return points.gather(1, which[..., None].expand(-1, -1, points.shape[-1]))
-
-    into, out = at(y, run), at(y[:, 1:], stop)
+    b, i = inside.nonzero(as_tuple=True)
+    run, stop, middle = run[b, i], stop[b, i], middle[b, i]
+    into, out, nearest = y[b, run], y[b, stop + 1], near[b, middle]
     across = out - into
+    along = _unit(across, into)
     e_in, e_out = _unit(into, across), _unit(out, across)
-    aside = near - (near * _unit(across, into)).sum(-1, keepdim=True) * _unit(across, into)
-    e_mid = _unit(at(near, middle), at(_sideways(aside, across), middle))
+    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
+    e_mid = _unit(nearest, _sideways(aside, across))
     walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
-    half = (walked[:, :-1] + walked[:, 1:]) / 2  # at the middle of each segment
-    begin, end = walked.gather(1, run), walked.gather(1, stop + 1)
+    half = (walked[b, i] + walked[b, i + 1]) / 2  # at the middle of each segment
+    begin, end = walked[b, run], walked[b, stop + 1]
     share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
     to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
     angle = share * (to_mid + to_out)
@@ -176,12 +176,15 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
     """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
     for ends, held in ((y[:, :-1], pinned[:-1]), (y[:, 1:], pinned[1:])):
-        length = ends.norm(dim=-1, keepdim=True)
-        e = ends / length.clamp_min(1e-12)
-        beyond = held[:, None] & ((n * ends).sum(-1, keepdim=True) < 1) & (length >= 1)
+        some = held.nonzero()[:, 0]  # a few of many segments
+        at, normal = ends[:, some], n[:, some]
+        length = at.norm(dim=-1, keepdim=True)
+        e = at / length.clamp_min(1e-12)
+        beyond = ((normal * at).sum(-1, keepdim=True) < 1) & (length >= 1)
         cosine = 1 / length.clamp_min(1.0)
-        aside = _unit(n - (n * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
-        n = torch.where(beyond, cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside, n)
+        aside = _unit(normal - (normal * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
+        turned_to = cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside
+        n = n.index_copy(1, some, torch.where(beyond, turned_to, normal))
     return n
 
 
