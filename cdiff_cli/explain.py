@@ -9,6 +9,7 @@ from rich.table import Table
 from cdiff_cli import figures
 from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import Reachable
 from cdiff_cli.observed import Observed
 from cdiff_cli.projection import has_exact_form
@@ -51,7 +52,14 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             obey,
         )
     out.print(table)
+    fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
+    if len(task.positions) != 2:
+        out.print(f"picture  none: the states of {name} have no place in the plane; `cdiff rollout` draws h over time")
+        return
+    if not fixed.parts:
+        out.print("picture  none: where these constraints lie is observed only while acting; `cdiff rollout` draws them")
+        return
     picture.parent.mkdir(parents=True, exist_ok=True)
     sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
-    figures.constraint_picture(picture, task, g, sample, file.stem)
+    figures.constraint_picture(picture, task, fixed, sample, file.stem)
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
