@@ -4,6 +4,7 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cdiff_cli import figures
@@ -43,11 +44,11 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             "" if demonstrations is None or form is not part else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
         )
         table.add_row(
-            spec.name,
+            escape(spec.name),
             spec.kind,
-            spec.describe(),
+            escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
-            ", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used),
+            escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
             "exact" if has_exact_form(form) else "ADMM" if isinstance(form, Reachable) else "sequential (ProxQP)",
             obey,
         )

@@ -15,7 +15,7 @@ DRAWS = 9999
 
 
 def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
-    """Interval of the mean, bias-corrected and accelerated bootstrap (Efron, 1987); None of fewer than two values, or of infinite ones.
+    """Interval of the mean, bias-corrected and accelerated bootstrap (Efron, 1987); None of fewer than two, or of infinite ones.
 
     The resampling is seeded: equal values give equal intervals.
     """

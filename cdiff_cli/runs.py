@@ -207,9 +207,8 @@ class Cell:
 
     def text(self, digits: int) -> str:
         mean = _number(self.mean, digits)
-        if math.isfinite(self.error) and (
-            self.error != 0 or self.mean == 0
-        ):  # otherwise one value, or one for the whole batch: times, calls
+        one = self.error == 0 != self.mean  # for the whole batch: times, calls
+        if math.isfinite(self.error) and not one:
             mean = f"{mean} ± {self.error:.{digits}f}"
         if self.interval is None:
             return mean
