@@ -58,7 +58,9 @@ Env = Annotated[list[str] | None, typer.Option(help="control: an option of the e
 Calibrate = Annotated[
     bool, typer.Option("--calibrate", help="control: measure how far execution leaves the plans, write the margins")
 ]
-Confidence = Annotated[float, typer.Option("--level", help="--calibrate: share of episodes that the margins are to cover")]
+Confidence = Annotated[
+    float | None, typer.Option("--level", help="--calibrate: share of episodes that the margins are to cover [default: 0.95]")
+]
 RunsFolder = Annotated[Path, typer.Option("--runs", help="where runs are kept")]
 
 
@@ -156,13 +158,16 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         found = json.loads(render(groups, table, "json"))
         typer.echo(json.dumps({"run": str(finished.path), "summary": found, "certificate": finished.counts}))
-        return
-    transposed(groups[0], table)
-    for note in finished.notes:
-        typer.echo(note)
-    typer.echo(f"run          {finished.path}")
-    typer.echo(f"picture      {finished.picture}")
-    typer.echo(finished.verdict)
+    else:
+        transposed(groups[0], table)
+        for note in finished.notes:
+            typer.echo(note)
+        typer.echo(f"run          {finished.path}")
+        typer.echo(f"picture      {finished.picture}")
+        typer.echo(finished.verdict)
+    if finished.warning:
+        typer.echo(f"warning: {finished.warning}", err=True)
+        raise typer.Exit(1)
 
 
 def transposed(group: Any, names: tuple[str, ...]) -> None:
@@ -254,7 +259,7 @@ def rollout(
     action_noise: ActionNoise = 0.0,
     env: Env = None,
     calibrate: Calibrate = False,
-    level: Confidence = 0.95,
+    level: Confidence = None,
     video: Annotated[str | None, typer.Option(help="gif or mp4 of the first episode")] = None,
     runs: RunsFolder = RUNS,
     as_json: AsJson = False,
@@ -268,13 +273,19 @@ def rollout(
     from cdiff_cli.request import resolve
     from cdiff_cli.runs import CONTROL_TABLE, QUALITY_TABLE, ROLLOUT_TABLE, SAFETY_TABLE
 
-    resolved = resolve(options(given | ({"margin": 0.0} if calibrate else {})))
-    if resolved.recipe.frame == "relative":
+    if calibrate and video:
+        raise CdiffError("--video: --calibrate writes margins and no run; leave it out")
+    if level is not None and not calibrate:
+        raise CdiffError("--level: belongs to --calibrate; leave it out, or add that")
+    resolved = resolve(options(given))
+    if resolved.acts:
         from cdiff_cli import closed_loop
 
         with progress() as tick:
             if calibrate:
-                typer.echo(closed_loop.calibrated_text(*closed_loop.calibrate(resolved, tick, level)))
+                where, found = closed_loop.calibrate(resolved, tick, 0.95 if level is None else level)
+                said = {"file": str(where)} | found.model_dump(mode="json")
+                typer.echo(json.dumps(said) if as_json else closed_loop.calibrated_text(where, found))
                 return
             finished = closed_loop.control_run(resolved, runs, tick, video)
         finish(finished, CONTROL_TABLE, as_json)

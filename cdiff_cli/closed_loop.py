@@ -16,7 +16,7 @@ from cdiff_cli.control import Controller, control
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
-from cdiff_cli.margins import Margin, Margins, conformal, errors, write_margins
+from cdiff_cli.margins import Margin, Margins, conformal, errors, require_enough, write_margins
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
 from cdiff_cli.request import Resolved
@@ -43,19 +43,20 @@ def control_run(
             control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
         if recorder:
             recorder.write(done, levels)
-    notes = (
-        [f"warning: {int(done.diverged.sum())} of {len(rows)} episodes diverged and were stopped"] if done.diverged.any() else []
-    )
+    warning = f"{_diverged(done)}; what they had done until then is kept" if done.diverged.any() else ""
     counts = {"episodes": len(rows), "safe_executed": int(sum(row["safe_executed"] for row in rows))}
     verdict = f"executed     {counts['safe_executed']} of {len(rows)} episodes safe at every step"
-    return Finished(run.path, rows, run.path / "rollout.png", cast(Any, counts), verdict, tuple(notes))
+    return Finished(run.path, rows, run.path / "rollout.png", cast(Any, counts), verdict, warning=warning)
 
 
 def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margins]:
     """Act without a margin, and write the margins that cover how far execution left the plans, beside the checkpoint."""
+    require_enough(resolved.options.n, level)
     acting, checkpoint = controller(resolved), resolved.checkpoint
     assert checkpoint is not None
     done = control(acting, resolved.seeds, parse_env(acting.task, resolved.options.env), on_step=lambda k, n: tick("control", k, n))
+    if done.diverged.any():
+        raise CdiffError(f"{_diverged(done)}: no margin covers that; nothing was written")
     executed = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
     scores = errors(done.foreseen, executed)
     by_name = {
@@ -76,6 +77,12 @@ def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margi
     return write_margins(checkpoint.path, resolved.constraints_path.stem, found), found
 
 
+def _diverged(done: Episodes) -> str:
+    return (
+        f"{int(done.diverged.sum())} of {len(done.x)} episodes diverged (a plan or a state was no longer finite) and were stopped"
+    )
+
+
 def controller(resolved: Resolved) -> Controller:
     """What acting needs."""
     problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
@@ -93,8 +100,6 @@ def controller(resolved: Resolved) -> Controller:
     warm = preset.warm if options.warm is None else options.warm
     if warm is not None and not 0 < warm <= 1:
         raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
-    if options.action_noise < 0:
-        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
     return Controller(
         task=cast(ControlTask, problem.task),
         denoiser=resolved.guided or problem.denoiser,
@@ -123,7 +128,11 @@ def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:
     found = {}
     for pair in pairs:
         name, equals, text = pair.partition("=")
-        if not equals or name not in known:
+        if not equals and name in known:
+            raise CdiffError(f'--env: expected name=value such as {name}={next(iter(known[name]))}, found "{pair}"')
+        if name in found:
+            raise CdiffError(f"--env {name}: given twice; it has one value an episode")
+        if name not in known:
             has = ", ".join(known) or "none"
             raise CdiffError(f'--env: {task.name} has no option "{name}"{suggestion(name, known)}; its options are: {has}')
         values = {str(value).lower(): value for value in known[name]}

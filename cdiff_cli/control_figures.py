@@ -74,6 +74,8 @@ class Recorder:
         """levels   of all episodes [n, steps + 1, parts]; the first is drawn"""
         import imageio.v3 as iio
 
+        if not self.plans:  # the first plan was not finite: there is nothing to show
+            return
         options: Any = {"duration": 40, "loop": 0} if self.path.suffix == ".gif" else {"fps": 25, "macro_block_size": 2}
         iio.imwrite(self.path, np.stack(list(self._composed(done, levels[0]))), **options)
 

@@ -168,10 +168,13 @@ def load_dataset(task: Task, source: str) -> list[Array]:
     return _minari_episodes(minari, source, task)[0]
 
 
-def load_inputs(source: str) -> list[Array]:
-    """The inputs of the episodes of a Minari dataset, each [steps, m]; none of an HDF5 file, whose inputs keep its own frame."""
+def load_inputs(task: Task, source: str) -> list[Array]:
+    """The inputs of the episodes of a Minari dataset or, of control tasks, of an HDF5 file, each [steps, m]; none of another
+    task's HDF5 file, whose inputs keep its own frame.
+    """
     if Path(source).suffix in (".hdf5", ".h5"):
-        return []
+        actions = getattr(task, "actions", ())
+        return [_checked(u, task, source, "actions", actions) for u in _hdf5(Path(source), "actions")] if actions else []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         dataset = _minari().load_dataset(source)
@@ -226,33 +229,40 @@ def _minari_episodes(minari: Any, name: str, task: Task) -> tuple[list[Array], d
 
 
 def _hdf5_episodes(path: Path, task: Task) -> Iterator[Array]:
-    """D4RL's layout: observations [n, dim], timeouts or terminals [n] marking each episode's last step."""
+    for episode in _hdf5(path, "observations"):
+        yield _checked(task.from_d4rl(_checked(episode, task, str(path))), task, str(path))
+
+
+def _hdf5(path: Path, name: str) -> list[Array]:
+    """That array of the file, episode by episode. D4RL's layout: observations [n, dim], actions [n, m], timeouts or terminals [n]
+    marking each episode's last step.
+    """
     import h5py
 
     if not path.exists():
         raise CdiffError(f"{path}: no such file; expected a D4RL-style HDF5 dataset")
     try:
         with h5py.File(path, "r") as file:
-            states = np.asarray(file["observations"], dtype=np.float64)
-            if len(states) == 0:
-                raise ValueError("observations is empty")
-            ends = np.zeros(len(states), dtype=bool)
+            rows = np.asarray(file[name], dtype=np.float64)
+            if len(rows) == 0:
+                raise ValueError(f"{name} is empty")
+            ends = np.zeros(len(rows), dtype=bool)
             for key in ("timeouts", "terminals"):
                 if key in file:
                     ends |= np.asarray(file[key], dtype=bool)
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs observations and timeouts") from None
-    for episode in np.split(states, np.flatnonzero(ends) + 1):
-        if len(episode):
-            yield _checked(task.from_d4rl(_checked(episode, task, str(path))), task, str(path))
+        raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs {name} and timeouts") from None
+    return [episode for episode in np.split(rows, np.flatnonzero(ends) + 1) if len(episode)]
 
 
-def _checked(episode: Array, task: Task, source: str) -> Array:
-    if episode.ndim != 2 or episode.shape[1] != len(task.layout):
+def _checked(episode: Array, task: Task, source: str, what: str = "observations", names: Sequence[str] = ()) -> Array:
+    """The episode, if its columns can be those names, else the task's coordinates."""
+    names = names or task.layout
+    if episode.ndim != 2 or episode.shape[1] != len(names):
         raise CdiffError(
-            f"{source}: observations of shape {episode.shape}, but {task.name} has {len(task.layout)} coordinates "
-            f"({', '.join(task.layout)}); choose a dataset of this environment"
+            f"{source}: {what} of shape {episode.shape}, but {task.name} has {len(names)} "
+            f"{'coordinates' if what == 'observations' else 'inputs'} ({', '.join(names)}); choose a dataset of this environment"
         )
     if not np.isfinite(episode).all():
-        raise CdiffError(f"{source}: observations hold NaN or inf; repair or choose another dataset")
+        raise CdiffError(f"{source}: {what} hold NaN or inf; repair or choose another dataset")
     return episode

@@ -29,7 +29,10 @@ Tick = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Finished:
-    """A run that is on disk, and what the command prints of it: its rows, its picture, its verdict in a line and in numbers."""
+    """A run that is on disk, and what the command prints of it: its rows, its picture, its verdict in a line and in numbers.
+
+    warning   what went wrong and is kept: the command says so on stderr and exits with 1
+    """
 
     path: Path
     rows: list[Row]
@@ -37,10 +40,14 @@ class Finished:
     counts: dict[str, int | None]
     verdict: str
     notes: tuple[str, ...] = ()
+    warning: str = ""
 
 
 def plan_run(resolved: Resolved, root: Path, tick: Tick, *, name: str | None = None, pictures: bool = True) -> Finished:
     """Plan, measure, write runs/<stamp>-plan-.../, or <stamp>-<name>"""
+    name_of_task = resolved.problem.task.name
+    if resolved.acts:
+        raise CdiffError(f"{name_of_task} plans anew at every step; act with `cdiff rollout --task {name_of_task}`")
     plans, free = _plan_both(resolved, tick)
     rows = _plan_rows(resolved, plans, free)
     notes = []

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cdiff_cli import figures
 from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import Reachable
 from cdiff_cli.observed import Observed
 from cdiff_cli.projection import has_exact_form
@@ -42,16 +44,23 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             "" if demonstrations is None or form is not part else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
         )
         table.add_row(
-            spec.name,
+            escape(spec.name),
             spec.kind,
-            spec.describe(),
+            escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
-            ", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used),
+            escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
             "exact" if has_exact_form(form) else "ADMM" if isinstance(form, Reachable) else "sequential (ProxQP)",
             obey,
         )
     out.print(table)
+    fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
+    if len(task.positions) != 2:
+        out.print(f"picture  none: the states of {name} have no place in the plane; `cdiff rollout` draws h over time")
+        return
+    if not fixed.parts:
+        out.print("picture  none: where these constraints lie is observed only while acting; `cdiff rollout` draws them")
+        return
     picture.parent.mkdir(parents=True, exist_ok=True)
     sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
-    figures.constraint_picture(picture, task, g, sample, file.stem)
+    figures.constraint_picture(picture, task, fixed, sample, file.stem)
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)

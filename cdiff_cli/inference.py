@@ -15,7 +15,7 @@ DRAWS = 9999
 
 
 def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
-    """Interval of the mean, bias-corrected and accelerated bootstrap (Efron, 1987); None of fewer than two values.
+    """Interval of the mean, bias-corrected and accelerated bootstrap (Efron, 1987); None of fewer than two, or of infinite ones.
 
     The resampling is seeded: equal values give equal intervals.
     """
@@ -23,7 +23,7 @@ def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
 
     x = np.asarray(values, dtype=np.float64)
     n = len(x)
-    if n < 2:
+    if n < 2 or not np.isfinite(x).all():
         return None
     mean, means = x.mean(), x[_resamples(n)].mean(1)
     if x.min() == x.max() or means.min() == means.max():

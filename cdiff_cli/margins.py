@@ -78,12 +78,23 @@ def conformal(scores: Array, level: float) -> float:
     """The smallest score that covers a further exchangeable one with probability `level`: the ceil((n + 1) level)-th of n
     (split conformal prediction; Vovk et al., 2005). CdiffError where n is too small for the level.
     """
-    n = len(scores)
-    rank = math.ceil((n + 1) * level)
-    if rank > n:
-        need = math.ceil(level / (1 - level))
+    require_enough(len(scores), level)
+    return float(np.sort(scores)[_rank(len(scores), level) - 1])
+
+
+def require_enough(n: int, level: float) -> None:
+    """Refuse a level that is no probability, or that n scores cannot vouch for; raises CdiffError."""
+    if not 0 < level < 1:
+        raise CdiffError(f"--level: expected a share of episodes above 0 and below 1, found {level:g}")
+    if _rank(n, level) > n:
+        need = math.floor(level / (1 - level))
+        while _rank(need, level) > need:  # the quotient is rounded
+            need += 1
         raise CdiffError(f"{n} episodes cannot vouch for a level of {level:g}: it takes {need} or more; raise --episodes")
-    return float(np.sort(scores)[rank - 1])
+
+
+def _rank(n: int, level: float) -> int:
+    return math.ceil((n + 1) * level)
 
 
 def margins_path(checkpoint: Path) -> Path:

@@ -189,7 +189,7 @@ def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -
             "reward": float(np.nansum(episodes.reward[i])),
             "plan_violation": float(made.mean()) if len(made) else math.nan,
             "safe_plans": float((made <= SAFE).mean()) if len(made) else math.nan,
-            "safe_executed": float(not (worst > SAFE).any()),
+            "safe_executed": float(not (worst > SAFE).any() and not episodes.diverged[i]),  # a lost state is not safe
             "executed_violation": float(excess.sum()),
             "executed_worst": float(worst.max(initial=-np.inf)),
             "violation_rate": 100.0 * float((worst > SAFE).sum()) / max(int(count) + 1, 1),

@@ -1,6 +1,7 @@
 """From the options of a command to a resolved problem: recipe, preset, method, constraints, checkpoint, pins."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -57,6 +58,7 @@ class Options:
     margin: float | None = None
     action_noise: float = 0.0
     env: tuple[str, ...] = ()
+    calibrate: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,11 @@ class Resolved:
     def calls_a_step(self) -> int:
         """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
         return 2 if self.conditional is not None and self.settings["weight"] != 1.0 else 1
+
+    @property
+    def acts(self) -> bool:
+        """Whether the task is a control task, which plans anew at every step."""
+        return self.recipe.frame == "relative"
 
     @property
     def seeds(self) -> list[int]:
@@ -159,6 +166,7 @@ def resolve(options: Options) -> Resolved:
     if options.preset not in recipe.presets:
         known = ", ".join(recipe.presets)
         raise CdiffError(f'no preset "{options.preset}"{suggestion(options.preset, recipe.presets)}; {task.name} has {known}')
+    _require_applicable(options, recipe.frame == "relative")
     preset = recipe.presets[options.preset]
     settings = {**preset.methods.get(options.method, {}), **parse_settings(options.settings)}
     method = make_method(options.method, settings)
@@ -196,12 +204,30 @@ def resolve(options: Options) -> Resolved:
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
     margins = {part.name: options.margin for part in g.parts} if options.margin is not None else {}
-    if options.margin is None and preset.margin and checkpoint is not None:
+    if options.margin is None and preset.margin and checkpoint is not None and not options.calibrate:
         margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
     problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
     check_feasible(problem)
     conditioned = _conditional(kinds, path, checkpoint) if isinstance(method, Conditional) else None
     return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
+
+
+def _require_applicable(options: Options, acts: bool) -> None:
+    """Refuse options that would be ignored: those of whole plans on a control task, those of control on another."""
+    whole = ("start", "goal", "random", "no_dynamics")
+    control = ("execute", "warm", "margin", "action_noise", "env", "calibrate")
+    default = Options()
+    for name in whole if acts else control:
+        if getattr(options, name) != getattr(default, name):
+            flag = "--" + name.replace("_", "-")
+            why = "is for whole plans, and {} plans anew at every step" if acts else "is for control tasks, and {} is planned once"
+            raise CdiffError(f"{flag} {why.format(options.task)}; leave it out")
+    if options.calibrate and options.margin is not None:
+        raise CdiffError("--margin: --calibrate acts without one; leave it out")
+    if not 0 <= (options.margin or 0) < math.inf:
+        raise CdiffError(f"--margin: expected 0 or more, in the units of h, found {options.margin:g}")
+    if not 0 <= options.action_noise < math.inf:
+        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
 
 
 def _conditional(kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Checkpoint:

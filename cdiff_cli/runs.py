@@ -60,7 +60,7 @@ COLUMNS = {
     "violation_paper": Column("violation (paper)", 4, "violation in the paper's units"),
     "distance_paper": Column("distance (paper)", 2, "the paper's definition: distance to the mean unconstrained plan"),
     "reward": Column("return", 1, "sum of rewards"),
-    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6"),
+    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6, that did not diverge"),
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
@@ -201,12 +201,14 @@ class Cell:
     @classmethod
     def of(cls, values: Sequence[float], interval: Interval | None = None) -> "Cell":
         n = len(values)
-        error = statistics.stdev(values) / math.sqrt(n) if n > 1 else math.nan
+        finite = all(map(math.isfinite, values))
+        error = statistics.stdev(values) / math.sqrt(n) if n > 1 and finite else math.nan
         return cls(statistics.fmean(values), error, n, interval)
 
     def text(self, digits: int) -> str:
         mean = _number(self.mean, digits)
-        if self.n > 1 and (self.error != 0 or self.mean == 0):  # otherwise one value, or one for the whole batch: times, calls
+        one = self.error == 0 != self.mean  # for the whole batch: times, calls
+        if math.isfinite(self.error) and not one:
             mean = f"{mean} ± {self.error:.{digits}f}"
         if self.interval is None:
             return mean
@@ -238,8 +240,8 @@ def compare(rows: Sequence[Row], metrics: Sequence[str] | None = None, intervals
     groups = []
     for key, by_seed in newest(rows).items():
         mine = list(by_seed.values())
-        names = metrics or [name for name in COLUMNS if any(isinstance(row.get(name), float) for row in mine)]
-        values = {name: [row[name] for row in mine if isinstance(row.get(name), float)] for name in names}
+        names = metrics or [name for name in COLUMNS if any(_has(row, name) for row in mine)]
+        values = {name: [row[name] for row in mine if _has(row, name)] for name in names}
         bounds = {name: interval(v, COLUMNS[name].share) for name, v in values.items() if intervals and name not in COSTS}
         groups.append(Group(key, len(mine), {name: Cell.of(v, bounds.get(name)) for name, v in values.items() if v}))
     return groups
@@ -270,8 +272,8 @@ def differences(rows: Sequence[Row], reference: str, metrics: Sequence[str], tes
         for key, mine in groups.items():
             task, constraints, method, preset = key
             theirs = groups.get((task, constraints, reference, preset), {})
-            both = [seed for seed in mine if isinstance(mine[seed].get(name), float)]
-            both = [seed for seed in both if isinstance(theirs.get(seed, {}).get(name), float)]
+            both = [seed for seed in mine if _has(mine[seed], name)]
+            both = [seed for seed in both if _has(theirs.get(seed, {}), name)]
             d = [mine[seed][name] - theirs[seed][name] for seed in both]
             if method != reference and d and name not in COSTS:
                 p = paired_p(d, test, COLUMNS[name].share)
@@ -281,6 +283,11 @@ def differences(rows: Sequence[Row], reference: str, metrics: Sequence[str], tes
         corrected = holm([each.p for each in family])
         found += [replace(each, holm=p) for each, p in zip(family, corrected, strict=True)]
     return found
+
+
+def _has(row: Row, name: str) -> bool:
+    """Whether the metric has a value: of an episode that diverged at once, or never acted, some have none."""
+    return isinstance(row.get(name), float) and not math.isnan(row[name])
 
 
 def _number(value: float, digits: int) -> str:

@@ -116,7 +116,8 @@ def tabulate(header: Sequence[str], lines: Sequence[Sequence[str]], style: str, 
 
 def _record(group: Group, metrics: Sequence[str], paper: Paper | None) -> dict[str, Any]:
     def cell(value: Cell) -> dict[str, Any]:
-        found = {"mean": value.mean, "standard_error": value.error if value.n > 1 else None, "n": value.n}
+        mean, error = (number if math.isfinite(number) else None for number in (value.mean, value.error))  # JSON has no others
+        found = {"mean": mean, "standard_error": error, "n": value.n}
         return found if value.interval is None else found | {"interval": list(value.interval)}
 
     record: dict[str, Any] = dict(zip(KEYS, group.key, strict=True)) | {"n": group.n}

@@ -85,6 +85,8 @@ def train(
         raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or add it')
     asked = recipe.demonstrations
     episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
+    source = dataset or f"cdiff/{task.name}-v0"
+    inputs = load_inputs(task, source)  # before the long part: a dataset without them is refused at once
     data = Data.of(task, recipe, spec, episodes, condition)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
@@ -108,8 +110,6 @@ def train(
             state.save(work / "state.safetensors")
         raise
     state.save(work / "state.safetensors")
-    source = dataset or f"cdiff/{task.name}-v0"
-    inputs = load_inputs(source)
     dynamics = fit_dynamics(episodes, inputs)
     inverse, explained = None, None
     if spec.inverse is not None:

@@ -105,6 +105,11 @@ def find_runs(place: Path) -> list[Path]:
 
 def verify_run(path: Path) -> Verified:
     """Recompute a run's certificate from run.yaml, plan.npz and rollout.npz; raises CdiffError where one cannot be read."""
+    if (path / "rollout.npz").exists() and not any((path / name).exists() for name in FILES[1:]):
+        raise CdiffError(
+            f"{path}: a closed-loop run, planned anew at every step; certificates are of whole plans: what it executed is scored "
+            "in its rows.csv, see `cdiff compare`"
+        )
     for name in FILES:
         if not (path / name).is_file():
             raise CdiffError(f"{path}: {name} is missing; plan again, or restore it")
