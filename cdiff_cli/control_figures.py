@@ -18,7 +18,7 @@ from cdiff_cli.episodes import Episodes
 
 Array = NDArray[np.float64]
 UNSAFE, SAFE, FORESEEN = "#d1495b", "#1d4e89", "#9aa5b1"
-EVERY = 2  # environment steps a video frame
+FRAME, FRAMES = 0.04, 250  # seconds a video frame at true speed; frames at most: longer episodes are shown faster
 
 
 def levels_picture(path: Path, controller: Controller, done: Episodes, levels: Array, title: str) -> None:
@@ -59,13 +59,14 @@ class Recorder:
         self.path, self.controller = path, controller
         self.frames: list[NDArray[np.uint8]] = []
         self.plans: list[Array] = []
+        self.every = max(round(FRAME / controller.task.dt), -(-controller.task.max_steps // FRAMES), 1)
 
     @property
     def plane(self) -> bool:
         return len(self.controller.task.positions) == 2
 
     def __call__(self, tau: int, env: Any, plan: Array) -> None:
-        if tau % EVERY == 0:
+        if tau % self.every == 0:
             self.plans.append(plan.copy())
             if not self.plane:
                 self.frames.append(env.render())
@@ -88,7 +89,7 @@ class Recorder:
         strip.set(xlabel="time / s", ylabel="h, unsafe below 0")
         strip.legend(loc="upper right", fontsize=7, frameon=False)
         for number, plan in enumerate(self.plans):
-            tau = EVERY * number
+            tau = self.every * number
             scene.clear()
             if self.plane:
                 self._map(scene, done, tau, plan)

@@ -16,6 +16,8 @@ MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "wall", "calls")
 SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
+CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
+BALL = ("reward", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "contacts", "braked", "calls")
 QUALITY = ("wall", "smooth", "success", "jump", "residual", "acceleration", "effort", "goal_distance")
 
 
@@ -36,6 +38,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "table1-large": lambda: of_rows("table1-large", PAPER, paper=True),
     "safety-umaze": lambda: of_rows("safety-umaze", SAFETY),
     "safety-large": lambda: of_rows("safety-large", SAFETY),
+    "table2-hopper": lambda: of_rows("table2-hopper", CONTROL, paper=True),
+    "table2-swimmer": lambda: of_rows("table2-swimmer", CONTROL, paper=True),
+    "table3": lambda: of_rows("table3", BALL, paper=True),
     "quality": lambda: of_rows("quality", QUALITY),
     "metrics": of_metrics,
 }

@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,9 +79,13 @@ class Locomotion:
 
             if render:
                 os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a display
-                options = {"width": 320, "height": 240} | options
+                options = {"width": 240, "height": 180} | options
             mode = "rgb_array" if render else None
-            return gymnasium.make(self.env_id, render_mode=mode, max_episode_steps=self.max_steps, **options)
+            env = gymnasium.make(self.env_id, render_mode=mode, max_episode_steps=self.max_steps, **options)
+        if render:
+            quality = cast(Any, env.unwrapped).model.vis.quality
+            quality.offsamples, quality.shadowsize = 0, 0  # no antialiasing, no shadows: software draws ten times as fast
+        return env
 
     def observe(self, obs: Any) -> Array:
         """State of an observation, or states of a whole episode of observations."""
