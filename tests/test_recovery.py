@@ -21,7 +21,7 @@ class Begun(gymnasium.Wrapper):
         super().__init__(env)
         self.begin = begin
 
-    def reset(self, *, seed=None, options=None):  # noqa: ARG002
+    def reset(self, *, seed=None, options=None):
         return self.begin(self.env, seed)
 
 
