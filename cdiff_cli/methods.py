@@ -7,6 +7,9 @@ noisy     at x_t, the change made to x_{t-1}: the paper's
 estimate  at the clean estimate x0, the change made to x_{t-1}: ours for control; multipliers alone
 clean     at the clean estimate x0, which is changed before the reverse step: ours, see README, Deviations
 
+Of the dual methods on the last two, the rows of segments round a ball are those of tangent planes at x0 that turn evenly along the
+path (segments.py), which keep their places from step to step: g's own push each segment straight out, and so tear the plan.
+
 What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
 
@@ -18,12 +21,13 @@ import torch
 from torch.nn import functional as F
 
 from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
-from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
+from cdiff_cli.constraint import Constraint, Pins, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
 from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
 from cdiff_cli.safediffuser import SafeDiffuser
+from cdiff_cli.segments import turned
 
 On = Literal["noisy", "clean"]
 DualOn = Literal["noisy", "estimate", "clean"]
@@ -99,16 +103,18 @@ class PrimalDual:
     dynamics_from: float = DYNAMICS_FROM
 
     def init(self, x: Traj, g: Constraint) -> Rows:
-        return zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation)
+        return zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation, self.on != "noisy")
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
         if self.on != "clean":
-            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
+            at = step.x if self.on == "noisy" else step.x0
+            rows, pull, _ = linearise(g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive)
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
         g, dynamics = split(due(g, step.level, self.dynamics_from))
+        g = turned(g, step.x0, step.pins)
         rows, pull, size = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
@@ -157,12 +163,13 @@ class AugmentedLagrangian:
     positive: Positive = "none"
 
     def init(self, x: Traj, g: Constraint) -> AlmState:
-        return AlmState(zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation), self.rho)
+        return AlmState(zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation, self.on != "noisy"), self.rho)
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
         lam, rho, _ = state
         if self.on != "clean":
-            rows, pull, _ = linearise(g, step.x if self.on == "noisy" else step.x0, self.positive)
+            at = step.x if self.on == "noisy" else step.x0
+            rows, pull, _ = linearise(g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive)
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
@@ -170,6 +177,7 @@ class AugmentedLagrangian:
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
             return step.reverse(x0), AlmState(lam, rho, warm)
+        g = turned(g, step.x0, step.pins)
         rows, pull, _ = linearise(g, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         for _ in range(self.inner):
@@ -236,8 +244,9 @@ def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, R
     return F.silu(rows), lambda w: pull(w * slope), size
 
 
-def zeros(x: Traj, g: Constraint, expectation: Expectation) -> Rows:
-    n = g(x[:1]).shape[1]
+def zeros(x: Traj, g: Constraint, expectation: Expectation, planes: bool) -> Rows:
+    """Multipliers of the rows of g, or where segments go round balls of those of their tangent planes."""
+    n = (turned(g, x, Pins.none(x)) if planes else g)(x).shape[1]
     return x.new_zeros(1 if expectation == "batch_mean" else len(x), n)
 
 

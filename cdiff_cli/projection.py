@@ -27,11 +27,12 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.segments import nearest_in_planes, planes
+from cdiff_cli.segments import goes_round, nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
 def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
@@ -138,10 +139,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
 
 def tangible(part: Part) -> bool:
     """Whether planes tangent to the part's surface, a few a waypoint, make a convex part of its set (segments.py)."""
-    level = getattr(part, "level", None)
-    return (isinstance(part, Waypoints) and isinstance(level, Affine)) or (
-        isinstance(part, Segments) and isinstance(level, Ellipsoid) and level.side > 0
-    )
+    return (isinstance(part, Waypoints) and isinstance(part.level, Affine)) or goes_round(part)
 
 
 def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
@@ -199,53 +197,81 @@ def _dykstra(
     return x
 
 
-def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float, rounds: int = 50) -> Traj:
-    """Sequential linearisation, one plan after another: min |x - z|^2 s.t. g(x_k) + J(x_k) (x - x_k) <= 0, from x_0 = begin."""
+def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float) -> Traj:
+    """Sequential linearisation, one plan after another; InfeasibleError names the parts in conflict where nothing was found."""
+    out = z.clone()
+    for b in range(len(z)):
+        target, x = z[b : b + 1].double(), begin[b : b + 1].double()
+        held = Pins(pins.mask, x)
+        one = g.take(torch.tensor([b], device=z.device)).to(x)
+        at = _linearised(one, target, x, held, tolerance)
+        if not _holds(one, at, held):
+            kept = _conflict(one, target, x, held, tolerance)
+            raise InfeasibleError(
+                "no trajectory found that satisfies all constraints together; in conflict: "
+                f"{', '.join(_worst_row(part, at, held) for part in kept)}; relax or remove one of them"
+            )
+        out[b] = at[0].to(z)
+    return out
+
+
+def _linearised(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float, rounds: int = 50) -> Traj:
+    """Of one plan in float64: min |x - z|^2 s.t. g(x_k) + J(x_k) (x - x_k) <= 0, from x_0 = begin. The last x_k."""
     import qpsolvers
     from scipy import sparse
 
-    out = z.clone()
-    for b in range(len(z)):
-        free = ~pins.mask.flatten().cpu().numpy()
-        target = z[b].double().cpu().numpy().ravel()
-        matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
-        x = begin[b : b + 1].double()
-        one = Pins(pins.mask, x)
-        g64 = g.take(torch.tensor([b], device=z.device)).to(x)
-        for _ in range(rounds):
-            rows, pull, _ = g64.linearise(x)
-            jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]
-            slack = -rows[0].cpu().numpy() + jacobian @ x.flatten().cpu().numpy()[free]
-            useful = np.abs(jacobian).max(1) > 1e-12
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # ProxQP's format advice
-                step = qpsolvers.solve_qp(
-                    matrix(np.eye(int(free.sum()))),
-                    -target[free],
-                    matrix(jacobian[useful]),
-                    slack[useful],
-                    solver="proxqp",
-                    eps_abs=min(tolerance, 1e-9),
-                )
-            if step is None or not np.isfinite(step).all():
-                break
-            flat = x.flatten().clone()
-            flat[torch.from_numpy(free).to(x.device)] = torch.from_numpy(step).to(x)
-            moved = float((flat - x.flatten()).abs().max())
-            x = flat.reshape(x.shape)
-            if moved < 1e-9:
-                break
-        worst = _free_rows(g64, x, one)[0]
-        if not bool((worst <= 1e-5).all()):
-            labels = g.labels(z.shape[1])
-            order = worst.argsort(descending=True)[:4].tolist()
-            rows_in_conflict = ", ".join(f"{labels[i]} ({float(worst[i]):.3g} over)" for i in order if float(worst[i]) > 1e-5)
-            raise InfeasibleError(
-                f"no trajectory found that satisfies all constraints together; in conflict: {rows_in_conflict or labels[0]}; "
-                "relax or remove one of them"
+    x, target, free = begin, z.cpu().numpy().ravel(), ~pins.mask.flatten().cpu().numpy()
+    matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
+    for _ in range(rounds):
+        rows, pull, _ = g.linearise(x)
+        jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]
+        slack = -rows[0].cpu().numpy() + jacobian @ x.flatten().cpu().numpy()[free]
+        useful = np.abs(jacobian).max(1) > 1e-12
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # ProxQP's format advice
+            step = qpsolvers.solve_qp(
+                matrix(np.eye(int(free.sum()))),
+                -target[free],
+                matrix(jacobian[useful]),
+                slack[useful],
+                solver="proxqp",
+                eps_abs=min(tolerance, 1e-9),
             )
-        out[b] = x[0].to(z)
-    return out
+        if step is None or not np.isfinite(step).all():
+            break
+        flat = x.flatten().clone()
+        flat[torch.from_numpy(free).to(x.device)] = torch.from_numpy(step).to(x)
+        moved = float((flat - x.flatten()).abs().max())
+        x = flat.reshape(x.shape)
+        if moved < 1e-9:
+            break
+    return x
+
+
+def _holds(g: Constraint, x: Traj, pins: Pins) -> bool:
+    return bool((_free_rows(g, x, pins) <= 1e-5).all())
+
+
+def _conflict(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float) -> list[Part]:
+    """Parts of g, and the pins, that together leave no feasible point that linearisation finds, and without any one of which it
+    finds one: a deletion filter (Chinneck and Dravnieks, 1991), over the first FILTERED parts; the others are all kept.
+    """
+    kept = list(g.parts)
+    for part in g.parts[:FILTERED]:
+        rest = [other for other in kept if other is not part]
+        fewer = Constraint(tuple(rest))
+        if rest and not _holds(fewer, _linearised(fewer, z, begin, pins, tolerance, rounds=10), pins):
+            kept = rest
+    return kept
+
+
+def _worst_row(part: Part, x: Traj, pins: Pins) -> str:
+    """The part by its worst row at x, or by its name where all of them hold."""
+    rows = _free_rows(Constraint((part,)), x, pins)[0]
+    if not bool((rows > 1e-5).any()):
+        return part.name
+    worst = int(rows.argmax())
+    return f"{part.labels(x.shape[1])[worst]} ({float(rows[worst]):.3g} over)"
 
 
 def _free_rows(g: Constraint, x: Traj, pins: Pins) -> Rows:

@@ -7,11 +7,12 @@ the normals turning evenly from where it enters to where it leaves: a push strai
 """
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
-from cdiff_cli.constraint import Pins, Segments, Traj, Waypoints
+from cdiff_cli.constraint import Constraint, Part, Pins, Segments, Traj, Waypoints
 from cdiff_cli.levels import Affine, Ellipsoid, dot, each_end
 
 Planes = tuple[Tensor, Tensor]
@@ -41,6 +42,29 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     return torch.stack([a for a, _ in each], 2), torch.stack([b for _, b in each], 2)
 
 
+def goes_round(part: Part) -> TypeGuard[Segments]:
+    """Whether the part keeps segments outside a ball or an ellipsoid, so that tangent planes stand for it."""
+    return isinstance(part, Segments) and isinstance(part.level, Ellipsoid) and part.level.side > 0
+
+
+def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint:
+    """g with each part that goes round a ball replaced by two: the half-spaces of its tangent planes at x, of the segment before
+    each waypoint and of the segment after. One row a waypoint, in the part's own units; -1 where there is no such segment.
+    """
+    parts: list[Part] = []
+    for part in g.parts:
+        if not goes_round(part):
+            parts.append(part)
+            continue
+        a, b = planes((part,), x, pins)
+        assert isinstance(part.level, Ellipsoid)
+        m = part.level.m.expand(x.shape[:2])
+        for slot in range(a.shape[2]):
+            bound = torch.where(b[..., slot] == NEVER, 1.0, m * b[..., slot])
+            parts.append(Waypoints(part.name, Affine(m[..., None] * a[..., slot, :], bound)))
+    return Constraint(tuple(parts))
+
+
 def _tangent(n: Tensor, level: Ellipsoid, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """The half-spaces n.y >= 1 as a.x <= b, y the level's scaled x."""
     slope = n / axes
@@ -65,7 +89,8 @@ def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
     n = _unit(near, first)
     inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-4)  # well above the rounding of a safe path
     if bool(inside.any()):
-        n = torch.where(inside[..., None], _turning(y, near, distance, inside), n)
+        n = n.clone()
+        n[inside] = _turning(y, near, distance, inside)
     return _tangent_to_pins(n, y, pinned)
 
 
@@ -111,7 +136,7 @@ def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
 
 
 def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tensor:
-    """Normals along runs of segments inside the sphere, as normals() describes [batch, n, k]."""
+    """Normals of the segments inside the sphere, along their runs, as normals() describes [segments inside, k]."""
     n = inside.shape[1]
     index = torch.arange(n, device=y.device).expand_as(inside)
     start = torch.where(inside, -1, index).cummax(1).values + 1  # first segment of the run
@@ -120,19 +145,18 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tenso
     deepest = torch.full_like(distance, torch.inf).scatter_reduce(1, run, torch.where(inside, distance, torch.inf), "amin")
     is_deepest = inside & (distance <= deepest.gather(1, run))
     middle = torch.full_like(index, n).scatter_reduce(1, run, torch.where(is_deepest, index, n), "amin").gather(1, run)
-    stop, middle = stop.clamp_min(0), middle.clamp_max(n - 1)
 
-    def at(points: Tensor, which: Tensor) -> Tensor:
-        return points.gather(1, which[..., None].expand(-1, -1, points.shape[-1]))
-
-    into, out = at(y, run), at(y[:, 1:], stop)
+    b, i = inside.nonzero(as_tuple=True)
+    run, stop, middle = run[b, i], stop[b, i], middle[b, i]
+    into, out, nearest = y[b, run], y[b, stop + 1], near[b, middle]
     across = out - into
+    along = _unit(across, into)
     e_in, e_out = _unit(into, across), _unit(out, across)
-    aside = near - (near * _unit(across, into)).sum(-1, keepdim=True) * _unit(across, into)
-    e_mid = _unit(at(near, middle), at(_sideways(aside, across), middle))
+    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
+    e_mid = _unit(nearest, _sideways(aside, across))
     walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
-    half = (walked[:, :-1] + walked[:, 1:]) / 2  # at the middle of each segment
-    begin, end = walked.gather(1, run), walked.gather(1, stop + 1)
+    half = (walked[b, i] + walked[b, i + 1]) / 2  # at the middle of each segment
+    begin, end = walked[b, run], walked[b, stop + 1]
     share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
     to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
     angle = share * (to_mid + to_out)
@@ -152,12 +176,15 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
     """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
     for ends, held in ((y[:, :-1], pinned[:-1]), (y[:, 1:], pinned[1:])):
-        length = ends.norm(dim=-1, keepdim=True)
-        e = ends / length.clamp_min(1e-12)
-        beyond = held[:, None] & ((n * ends).sum(-1, keepdim=True) < 1) & (length >= 1)
+        some = held.nonzero()[:, 0]  # a few of many segments
+        at, normal = ends[:, some], n[:, some]
+        length = at.norm(dim=-1, keepdim=True)
+        e = at / length.clamp_min(1e-12)
+        beyond = ((normal * at).sum(-1, keepdim=True) < 1) & (length >= 1)
         cosine = 1 / length.clamp_min(1.0)
-        aside = _unit(n - (n * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
-        n = torch.where(beyond, cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside, n)
+        aside = _unit(normal - (normal * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
+        turned_to = cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside
+        n = n.index_copy(1, some, torch.where(beyond, turned_to, normal))
     return n
 
 

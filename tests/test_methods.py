@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraint import Pins
+from cdiff_cli.constraint import Constraint, Pins, Segments, Waypoints
 from cdiff_cli.diffusion import Noise, Schedule, Step, sample
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
@@ -168,6 +168,44 @@ def test_clean_methods_end_on_the_half_space(method, extra_steps, most):
     g = waypoints(Affine(vec(1.0, 1.0), num(0.8)))  # the plans' x + y ~ N(1, 0.14^2): nearly all of them violate
     assert float(g(_plan(Unconstrained(), g)).max()) > 0.2
     assert float(g(_plan(method, g, extra_steps=extra_steps)).max()) <= most
+
+
+def _through_a_disc(method, offset=0.02, horizon=96):
+    """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
+    s = torch.linspace(-2, 2, horizon, dtype=F64)
+    line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
+    g = Constraint((Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    noise = draws(11, 1, horizon, 2)
+    return sample(gaussian_denoiser(SCHEDULE, line, 1e-3), SCHEDULE, method, g, pin(line, 0, -1), noise, extra_steps=20), g
+
+
+@pytest.mark.parametrize(
+    "method",
+    [Projected(), PrimalDual(), AugmentedLagrangian(), AugmentedLagrangian(inner=3)],
+    ids=["projected", "primal-dual", "alm", "alm inner"],
+)
+def test_clean_methods_go_round_a_disc_without_tearing(method):
+    x, g = _through_a_disc(method)
+    assert float(x[0].diff(dim=0).norm(dim=-1).max()) <= 4 * 4 / 95  # an even line stretches to about thrice
+    assert float(g(x).max()) <= 1e-2  # the multipliers are still settling; radius 0.5
+
+
+@pytest.mark.parametrize("on", ["noisy", "estimate", "clean"])
+@pytest.mark.parametrize("expectation", ["per_sample", "batch_mean"])
+@pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])
+def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expectation):
+    x = torch.linspace(-1, 1, 12, dtype=F64)[None, :, None] + 0.1 * normal(8, 3, 12, 2)
+    g = Constraint((Waypoints("wall", half_space()), Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5))))
+    method, pins = kind(on=on, expectation=expectation), pin(x, 0, -1)
+    state, sizes = method.init(x, g), set()
+    for _ in range(4):
+        sizes.add(getattr(state, "lam", state).shape)
+        out, state = method.step(_step(x, pins=pins), g, state)
+    plans = 1 if expectation == "batch_mean" else 3
+    assert sizes == {(plans, 12 + 11 if on == "noisy" else 12 + 2 * 12)}  # g's own rows: the paper's
+    assert bool(getattr(state, "lam", state).isfinite().all())
+    assert torch.equal(out[:, [0, -1]], x[:, [0, -1]])
+    assert not torch.equal(out, x)
 
 
 @pytest.mark.parametrize("method", [PrimalDual(), AugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"])

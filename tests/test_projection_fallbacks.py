@@ -7,7 +7,7 @@ from cdiff_cli.constraint import Chain, Constraint, Waypoints, stack
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Quadric
 from cdiff_cli.opaque import Opaque
-from cdiff_cli.projection import project
+from cdiff_cli.projection import FILTERED, project
 from tests.problems import (
     F64,
     KINDS,
@@ -71,6 +71,30 @@ def test_two_half_spaces_that_exclude_each_other_are_named():
     g = stack([waypoints(Affine(vec(1.0, 0.0), num(-1.0)), "left"), waypoints(Affine(vec(-1.0, 0.0), num(-1.0)), "right")])
     with pytest.raises(InfeasibleError, match=r"(left|right)@0.*over"):
         free_projection(g, torch.zeros(1, 1, 2, dtype=F64))
+
+
+def _slab(name, low, high):
+    """low <= x <= high, two parts."""
+    at_least, at_most = Affine(vec(-1.0, 0.0), num(-low)), Affine(vec(1.0, 0.0), num(high))
+    return Constraint((Waypoints(f"{name}.low", at_least), Waypoints(f"{name}.high", at_most)))
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_of_two_slabs_that_exclude_each_other_and_a_disc_only_the_two_sides_between_them_are_named(order):
+    disc = waypoints(ball(1, centre=(0.0, 3.0), radius=0.5), "disc")
+    parts = [_slab("near", -1.0, 1.0), disc, _slab("far", 2.0, 3.0)]
+    with pytest.raises(InfeasibleError) as caught:
+        free_projection(stack([parts[i] for i in order]), normal(5, 1, 4, 2))
+    said = str(caught.value).split("in conflict: ")[1]
+    assert "near.high" in said
+    assert "far.low" in said
+    assert not any(name in said for name in ("disc", "near.low", "far.high"))
+
+
+def test_of_more_parts_than_are_left_out_in_turn_the_conflicting_ones_are_still_among_those_named():
+    many = [_slab(f"slab{i}", -1.0 - i, 1.0 + i) for i in range(FILTERED)]
+    with pytest.raises(InfeasibleError, match=r"slab0\.high.*far\.low"):
+        free_projection(stack([*many, _slab("far", 1.5, 3.0)]), torch.zeros(1, 1, 2, dtype=F64))
 
 
 def test_an_empty_quadric_is_refused():
