@@ -34,7 +34,7 @@ def fit_inverse(
     every = [_transitions(x, u, spec.ahead) for x, u in zip(episodes, inputs, strict=True)]
     long = np.flatnonzero(lengths >= horizon)
     short = np.flatnonzero(lengths < horizon)
-    kept = {"windows": long[::HELD_OUT], "branches": short[::HELD_OUT]}
+    kept = {name: of[::HELD_OUT][: len(of) // 2] for name, of in (("windows", long), ("branches", short))}  # a single one is used
     held = set(np.concatenate(list(kept.values())).tolist())
     x, after, u = (torch.cat(parts) for parts in zip(*(t for i, t in enumerate(every) if i not in held), strict=True))
     with torch.random.fork_rng(devices=[]):

@@ -60,7 +60,7 @@ COLUMNS = {
     "violation_paper": Column("violation (paper)", 4, "violation in the paper's units"),
     "distance_paper": Column("distance (paper)", 2, "the paper's definition: distance to the mean unconstrained plan"),
     "reward": Column("return", 1, "sum of rewards"),
-    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6, that did not diverge"),
+    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6"),
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),

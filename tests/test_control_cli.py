@@ -213,7 +213,6 @@ REFUSED = {
     "warm in a maze": (MAZE, ["--warm", 0.3], ["--warm is for control tasks"]),
     "margin in a maze": (MAZE, ["--margin", 0.1], ["--margin is for control tasks"]),
     "noise in a maze": (MAZE, ["--action-noise", 0.1], ["--action-noise is for control tasks"]),
-    "no conditional planner": (BALL, ["--method", "conditional"], ["no conditional planner for these constraints"]),
     "best of k": (BALL, ["--method", "best-of-k"], ["best-of-k: only for whole plans, and ball-run plans anew"]),
     "constraints of another task": (BALL, ["--constraints", ROOT / "constraints/hopper.yaml"], [":3 task", "change one of them"]),
     "checkpoint of another task": (
@@ -235,6 +234,13 @@ def test_an_unknown_observed_quantity_is_met_with_those_there_are(tmp_path):
     file.write_text(OBSERVED)
     expected = [f"{file}:6 ", 'found "obstacle.z"', "ball-run offers obstacle.x, obstacle.y, obstacle.vx, obstacle.vy"]
     refused(*BALL, "--constraints", file, expected=expected, tmp_path=tmp_path)
+
+
+def test_without_a_planner_trained_for_the_constraints_conditional_says_how_to_get_one(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(OBSERVED.replace("obstacle.z", "obstacle.y"))
+    expected = ["no conditional planner for these constraints", f"`cdiff train --task ball-run --conditional {file}`"]
+    refused(*BALL, "--method", "conditional", "--constraints", file, expected=expected, tmp_path=tmp_path)
 
 
 def dataset(path, **columns):

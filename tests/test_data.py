@@ -10,8 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.data import Normaliser, Windows, demonstrations, digest, load_dataset
+from cdiff_cli.data import Normaliser, Windows, demonstrations, digest, load_dataset, load_inputs
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.tasks.locomotion import HOPPER
 from cdiff_cli.tasks.maze2d import LARGE, UMAZE
 
 LAYOUT = ("x", "y", "vx", "vy")
@@ -242,6 +243,18 @@ def test_d4rl_file_is_cut_at_its_ends_and_turned_into_this_frame(tmp_path):
     episodes = load_dataset(LARGE, str(path))
     assert [len(episode) for episode in episodes] == [3, 2, 1]
     assert episodes[0][0] == pytest.approx([-2.364, 2.851, -1.5, -0.5])
+
+
+def test_inputs_of_a_control_tasks_file_are_cut_like_its_states(tmp_path):
+    inputs = np.arange(18.0).reshape(6, 3)
+    path = write(tmp_path / "hopper.hdf5", observations=np.zeros((6, 11)), actions=inputs, timeouts=[0, 0, 1, 0, 0, 0])
+    assert [len(episode) for episode in load_dataset(HOPPER, str(path))] == [3, 3]
+    np.testing.assert_array_equal(load_inputs(HOPPER, str(path)), inputs.reshape(2, 3, 3))
+
+
+def test_inputs_of_a_mazes_file_stay_in_its_own_frame_and_are_not_read(tmp_path):
+    path = write(tmp_path / "maze.hdf5", observations=np.zeros((6, 4)), actions=np.zeros((6, 2)))
+    assert load_inputs(UMAZE, str(path)) == []
 
 
 def test_a_file_without_ends_is_one_episode(tmp_path):

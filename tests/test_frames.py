@@ -102,3 +102,9 @@ def test_inputs_stay_within_those_of_the_data(fitted):
 def test_without_inputs_there_is_no_inverse_dynamics_model():
     with pytest.raises(CdiffError, match="no inputs"):
         fit_inverse([episode(0, 100)[0]], [], 16, InverseSpec(), torch.zeros(3, dtype=torch.bool), 0)
+
+
+def test_a_single_episode_is_fitted_to_and_none_is_held_out():
+    x, u = episode(0, 40)
+    _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), torch.zeros(3, dtype=torch.bool), 0)
+    assert explained == {}

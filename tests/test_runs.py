@@ -1,5 +1,6 @@
 """Run directories, their rows, and the comparison of many runs."""
 
+import json
 import math
 import types
 
@@ -21,6 +22,7 @@ from cdiff_cli.runs import (
     write_rows,
     write_yaml,
 )
+from cdiff_cli.tables import render
 
 
 def row(seed: int = 0, method: str = "alm", preset: str = "paper", task: str = "maze2d-umaze", **metrics) -> dict:
@@ -234,3 +236,16 @@ def test_tables_name_only_known_columns():
     assert tables
     assert {name for table in tables for name in table} <= set(COLUMNS)
     assert set(KEYS).isdisjoint(COLUMNS)
+
+
+def test_a_metric_without_a_value_is_left_out_and_an_infinite_one_has_no_error():
+    rows = [row(0, reward=1.0, effort=math.inf), row(1, reward=math.nan, effort=1.0), row(2, reward=3.0, effort=1.0)]
+    (group,) = compare(rows, intervals=True)
+    assert (group.cells["reward"].mean, group.cells["reward"].n) == (2.0, 2)
+    assert (group.cells["effort"].text(2), group.cells["effort"].interval) == ("inf", None)
+    assert compare([row(0, reward=math.nan)])[0].cells == {}
+
+
+def test_json_of_an_infinite_metric_is_json():
+    said = render(compare([row(0, effort=math.inf), row(1, effort=1.0)]), ["effort"], "json")
+    assert json.loads(said, parse_constant=pytest.fail)[0]["effort"] == {"mean": None, "standard_error": None, "n": 2}

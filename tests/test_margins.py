@@ -1,0 +1,76 @@
+"""Margins: which errors count, the conformal quantile, the file beside the checkpoint."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdiff_cli.constraint import Constraint, Waypoints
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.levels import Affine
+from cdiff_cli.margins import Margin, Margins, calibrated, conformal, errors, read_margins, require_enough, tightened, write_margins
+from tests.problems import vec
+
+
+def test_the_margin_is_the_largest_of_19_at_95_percent_and_the_18th_at_90():
+    scores = np.random.default_rng(0).permutation(np.arange(1.0, 20.0))
+    assert conformal(scores, 0.95) == 19
+    assert conformal(scores, 0.9) == 18
+    assert conformal(scores, 0.5) == 10
+
+
+@given(st.integers(1, 60), st.floats(0.01, 0.99))
+def test_a_further_score_is_covered_as_often_as_promised(n, level):
+    """Of n + 1 exchangeable scores the last has each rank equally often: at most `rank` of n + 1 are covered, at least level."""
+    try:
+        found = conformal(np.arange(1.0, n + 1), level)
+    except CdiffError as error:
+        need = int(str(error).split("it takes ")[1].split()[0])
+        assert need > n
+        require_enough(need, level)
+        with pytest.raises(CdiffError):
+            require_enough(need - 1, level)
+    else:
+        assert level <= found / (n + 1) * (1 + 1e-12)  # the quotient is rounded
+        assert (found - 1) / (n + 1) < level * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, 2.0, math.nan])
+def test_a_level_is_a_probability(level):
+    with pytest.raises(CdiffError, match="--level: expected a share of episodes above 0 and below 1"):
+        require_enough(100, level)
+
+
+def test_the_error_of_an_episode_is_the_worst_near_the_limit():
+    """f, unsafe above 0: an error of 0.5 planned 2 off the limit could make nothing unsafe, one of 0.2 at the limit can."""
+    foreseen = np.array([[np.nan, -2.0, 0.0, -0.3], [np.nan, -5.0, -0.1, np.nan]])[..., None]
+    executed = np.array([[0.0, -1.5, 0.2, -0.4], [0.0, -5.0, -0.2, np.nan]])[..., None]
+    np.testing.assert_allclose(errors(foreseen, executed)[:, 0], [0.2, 0.0])
+
+
+def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
+    parts = [Waypoints(name, Affine(vec(1.0), torch.tensor(3.0, dtype=torch.float64))) for name in ("near", "other")]
+    g = tightened(Constraint(tuple(parts)), {"near": 0.25})
+    np.testing.assert_allclose(g(torch.full((1, 1, 1), 2.9, dtype=torch.float64))[0], [0.15, -0.1])
+
+
+def found(weights, margin):
+    one = Margin(margin=margin, median=0.0, largest=margin)
+    return Margins(
+        level=0.9, episodes=9, seed=0, weights_sha256=weights, method="alm", preset="recommended", constraints={"a": one}
+    )
+
+
+def test_margins_of_one_file_leave_those_of_others_and_belong_to_their_weights(tmp_path):
+    checkpoint = tmp_path / "small.safetensors"
+    assert read_margins(checkpoint) == {}
+    assert write_margins(checkpoint, "easy", found("w", 0.1)) == tmp_path / "small.margins.yaml"
+    write_margins(checkpoint, "hard", found("w", 0.2))
+    write_margins(checkpoint, "easy", found("w", 0.3))
+    assert calibrated(checkpoint, "w", "easy") == {"a": 0.3}
+    assert calibrated(checkpoint, "w", "hard") == {"a": 0.2}
+    assert calibrated(checkpoint, "other weights", "hard") == calibrated(checkpoint, "w", "unknown") == {}
+    assert [path.name for path in tmp_path.iterdir()] == ["small.margins.yaml"]
