@@ -107,6 +107,8 @@ class PrimalDual:
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
+        if self.on != "noisy" and idle(g, step, lam):
+            return step.reverse(step.x0), lam
         if self.on != "clean":
             at = step.x if self.on == "noisy" else step.x0
             rows, pull, _ = linearise(g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive)
@@ -167,12 +169,14 @@ class AugmentedLagrangian:
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
         lam, rho, _ = state
+        if self.on != "noisy" and idle(g, step, lam):
+            return step.reverse(step.x0), state._replace(rho=self._grown(rho))
         if self.on != "clean":
             at = step.x if self.on == "noisy" else step.x0
             rows, pull, _ = linearise(g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive)
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
-            return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self.c * rho)
+            return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self._grown(rho))
         g = due(g, step.level, self.dynamics_from)
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
@@ -184,7 +188,11 @@ class AugmentedLagrangian:
             rows, pull, size = linearise(g, x0, self.positive)
             lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
             x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
-        return step.reverse(x0), AlmState(lam, min(self.c * rho, max(self.rho, 1.0)))
+        return step.reverse(x0), AlmState(lam, self._grown(rho))
+
+    def _grown(self, rho: float) -> float:
+        """The next penalty weight."""
+        return min(self.c * rho, max(self.rho, 1.0)) if self.on == "clean" else self.c * rho
 
 
 METHODS: dict[str, type[Method]] = {
@@ -232,6 +240,11 @@ def slack(g: Rows, lam: Rows, rho: float) -> Rows:
 def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
     """lam + rho (g + s) with the slack above, which is [lam + rho g]_+ (tests/test_methods.py shows they are equal)."""
     return (lam + rho * g).clamp_min(0)
+
+
+def idle(g: Constraint, step: Step, lam: Rows) -> bool:
+    """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
+    return not dynamics_of(g) and not bool(lam.any()) and not bool((g(step.x0) > 0).any())
 
 
 def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
