@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -157,14 +157,12 @@ class _InUnits:
 
     def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
         scale = self.scale
-        y = Step(
+        y = replace(
+            step,
             x=scale * step.x,
             x0=scale * step.x0,
-            beta=step.beta,
-            level=step.level,
             reverse=lambda clean: scale * step.reverse(clean / scale),
             pins=Pins(step.pins.mask, scale * step.pins.values),
-            last=step.last,
         )
         out, state = self.method.step(y, g, state)
         return out / scale, state

@@ -220,3 +220,19 @@ def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     assert (done.braked == 1).all()
     np.testing.assert_allclose(done.x[0, 1:, 1], 0.9 * done.x[0, :-1, 1], atol=1e-6)
     assert (control(replace(acting, enforced=LIMIT), [0], steps=5).braked == 0).all()
+
+
+def test_what_a_step_tells_reaches_the_method():
+    """SafeDiffuser's variants ask how many steps are left."""
+    told = []
+
+    class Asked:
+        def init(self, x, g):
+            return None
+
+        def step(self, step, g, state):
+            told.append((step.left, step.last))
+            return step.reverse(step.x0), state
+
+    control(replace(FREE, method=Asked()), [0], steps=1)
+    assert told == [(2, False), (1, False), (0, True)]
