@@ -84,7 +84,8 @@ def main() -> None:
     Console(width=130).print(table)
     axis.axhline(0, color="#d1495b", lw=1.2)
     axis.set(xlabel="time / s", ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit, by alpha")
-    axis.legend(fontsize=8, frameon=False, ncols=5)
+    axis.set_ylim(bottom=-1.0)
+    axis.legend(fontsize=8, frameon=False, ncols=5, loc="lower center")
     figure.tight_layout()
     if asked.picture:
         figure.savefig(asked.picture, dpi=110)

@@ -79,8 +79,8 @@ def main() -> None:
     for title in ("task", "preset", "method", "calls", "network", "step", "95 %", "over the calls / %", "ProxQP"):
         table.add_column(title, justify="left" if title in ("task", "preset", "method") else "right")
     for task in asked.task:
-        for preset in ("recommended", "fast"):
-            each = {m: controller(resolve(Options(task=task, method=m, preset=preset))) for m in METHODS}
+        for preset, warm in (("recommended", None), ("recommended, warm 0.3", 0.3)):
+            each = {m: controller(resolve(Options(task=task, method=m, warm=warm))) for m in METHODS}
             found: dict[str, list[Any]] = {m: [] for m in METHODS}
             for _ in range(asked.repeats):
                 for method, acting in each.items():
