@@ -79,7 +79,7 @@ class Locomotion:
 
             if render:
                 os.environ.setdefault("MUJOCO_GL", "egl")  # draws without a display
-                options = {"width": 240, "height": 180} | options
+                options = {"width": 240, "height": 180, "camera_name": "track"} | options
             mode = "rgb_array" if render else None
             env = gymnasium.make(self.env_id, render_mode=mode, max_episode_steps=self.max_steps, **options)
         if render:
