@@ -55,7 +55,7 @@ def main() -> None:
     recipe = resolve(Options(task=NAME)).recipe
     task = both["alm"].task
     episodes = demonstrations(task, recipe.demonstrations.steps, recipe.demonstrations.seed)
-    inputs = load_inputs(f"cdiff/{NAME}-v0")
+    inputs = load_inputs(task, f"cdiff/{NAME}-v0")
     table = Table(title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}")
     for title in ("inverse dynamics", "R² windows", "R² random", "method", "return", "violation rate / %", "violating"):
         table.add_column(title, justify="right" if title[0] in "Rrv" else "left")
