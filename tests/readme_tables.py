@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 REFERENCE = ROOT / "runs" / "reference"
 MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "wall", "calls")
+PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "torn", "wall", "calls")
 SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
 CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
 BALL = ("reward", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "contacts", "braked", "calls")
