@@ -17,7 +17,7 @@ from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
 from cdiff_cli.methods import AlmState
 from cdiff_cli.networks import InverseDynamics
-from cdiff_cli.planning import MARGIN, synchronise
+from cdiff_cli.planning import MARGIN, Timed, synchronise
 from cdiff_cli.projection import project_from
 from cdiff_cli.tasks import ControlTask
 
@@ -251,18 +251,9 @@ def _plan_together(
     last: Array | None,
     draws: Tensor,
 ) -> _Found:
-    device, horizon, network_s = controller.device, controller.horizon, 0.0
+    device, horizon, timed = controller.device, controller.horizon, Timed(controller.denoiser, controller.device)
     synchronise(device)
     began = time.perf_counter()
-
-    def timed(x: Traj, t: int) -> Traj:
-        nonlocal network_s
-        synchronise(device)
-        before = time.perf_counter()
-        x0 = controller.denoiser(x, t)
-        synchronise(device)
-        network_s += time.perf_counter() - before
-        return x0
 
     with torch.inference_mode():
         here = torch.from_numpy(states)
@@ -307,7 +298,7 @@ def _plan_together(
         if controller.polish and controller.brake is not None:
             missed = (obeyed(torch.from_numpy(x)) > TOLERANCE).any(1).numpy()
     synchronise(device)
-    return _Found(x, scored, missed, time.perf_counter() - began, network_s)
+    return _Found(x, scored, missed, time.perf_counter() - began, timed.seconds)
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:

@@ -124,16 +124,7 @@ def plan(
     shape = (problem.horizon, dim)
     total = problem.schedule.n_steps + extra_steps
     keep_chain = total * len(seeds) * problem.horizon * dim <= 4_000_000
-    trace, chain, network_s, watching_s = [], [], 0.0, 0.0
-
-    def timed(x: Traj, t: int) -> Traj:
-        nonlocal network_s
-        synchronise(device)
-        began = time.perf_counter()
-        x0 = problem.denoiser(x, t)
-        synchronise(device)
-        network_s += time.perf_counter() - began
-        return x0
+    trace, chain, watching_s, timed = [], [], 0.0, Timed(problem.denoiser, device)
 
     def record(call: int, step: Step, x: Traj) -> None:
         nonlocal watching_s
@@ -173,7 +164,7 @@ def plan(
         polish=moved,
         calls=total,
         total_s=total_s,
-        network_s=network_s,
+        network_s=timed.seconds,
         u=u,
     )
 
@@ -264,6 +255,23 @@ def make_pins(problem: Problem, n: int, dtype: torch.dtype = torch.float32, devi
             values[:, index] = problem.normaliser.encode(torch.from_numpy(state))
     device = problem.device if device is None else device
     return Pins(mask.to(device), values.to(device, dtype))
+
+
+@dataclass
+class Timed:
+    """A denoiser whose wall time is added up."""
+
+    denoiser: Denoiser
+    device: torch.device
+    seconds: float = 0.0
+
+    def __call__(self, x: Traj, t: int) -> Traj:
+        synchronise(self.device)
+        began = time.perf_counter()
+        x0 = self.denoiser(x, t)
+        synchronise(self.device)
+        self.seconds += time.perf_counter() - began
+        return x0
 
 
 def synchronise(device: torch.device) -> None:
