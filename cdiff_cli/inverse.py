@@ -21,7 +21,7 @@ def fit_inverse(
     spec: InverseSpec,
     hidden: Tensor,
     seed: int,
-    on_step: Callable[[int, int], None] | None = None,
+    on_step: Callable[[int, int, float], None] | None = None,
 ) -> tuple[InverseDynamics, dict[str, float]]:
     """The model, and its R^2 (share of the inputs' variance explained) on episodes that it was not trained on: `windows` on those
     at least a horizon long, `branches` on the shorter ones, which hold random and strongly perturbed inputs.
@@ -51,7 +51,7 @@ def fit_inverse(
         optimiser.step()
         rate.step()
         if on_step:
-            on_step(step + 1, spec.steps)
+            on_step(step + 1, spec.steps, loss.item())
     net.eval().requires_grad_(False)
     return net, {name: _explained(net, [every[i] for i in which]) for name, which in kept.items() if len(which)}
 

@@ -33,10 +33,11 @@ def training_progress() -> Iterator[tuple[Callable[[int, int], None], Callable[[
     """Bars for the demonstrations, told (steps done, of how many), and for the training, told its status."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    shape = "{task.description:>14}", "{task.fields[loss]}", "{task.fields[rate]}"
+    shape = "{task.description:>16}", "{task.fields[loss]}", "{task.fields[rate]}"
     columns = (TextColumn(shape[0]), BarColumn(), MofNCompleteColumn(), TextColumn(shape[1]), TextColumn(shape[2]))
     with Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=err, disable=not err.is_terminal) as bar:
-        data, fit = None, None
+        data: Any = None
+        fits: dict[str, Any] = {}
 
         def on_data(done: int, total: int) -> None:
             nonlocal data
@@ -44,11 +45,10 @@ def training_progress() -> Iterator[tuple[Callable[[int, int], None], Callable[[
             bar.update(data, completed=done)
 
         def on_step(status: Any) -> None:
-            nonlocal fit
-            if fit is None:
-                fit = bar.add_task("training", total=status.steps, completed=status.step - 1, loss="", rate="")
+            if status.what not in fits:
+                fits[status.what] = bar.add_task(status.what, total=status.steps, completed=status.step - 1, loss="", rate="")
             speed = bar.tasks[-1].speed
             rate = f"{speed:.1f} steps/s" if speed else ""
-            bar.update(fit, completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
+            bar.update(fits[status.what], completed=status.step, loss=f"loss {status.loss:.4f}", rate=rate)
 
         yield on_data, on_step

@@ -34,11 +34,12 @@ Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor | None]]
 
 @dataclass(frozen=True)
 class Status:
-    """Told after each training step."""
+    """Told after each training step of the planner, then of the inverse dynamics."""
 
     step: int
     steps: int
     loss: float
+    what: str = "training"
 
 
 def choose_device(name: str) -> torch.device:
@@ -112,9 +113,14 @@ def train(
     state.save(work / "state.safetensors")
     dynamics = fit_dynamics(episodes, inputs)
     inverse, explained = None, None
+
+    def told(step: int, steps: int, loss: float) -> None:
+        if on_step:
+            on_step(Status(step, steps, loss, "inverse dynamics"))
+
     if spec.inverse is not None:
         hidden = torch.tensor([name in spec.inverse.hidden for name in task.layout])
-        inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, hidden, seed)
+        inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, hidden, seed, told)
     card = {
         "task": task.name,
         "recipe": size if condition is None else f"conditional-{condition.name}",
