@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -102,7 +102,7 @@ def control(
                 last = plans[alive] if tau and controller.warm is not None else None
                 method = _Resumed(controller.method, controller.execute, method.state if last is not None else None)
                 draws = _draws(controller, [generators[i] for i in alive])
-                found = _plan(controller, method, states[alive], log.now(alive), last, draws)
+                found = _plan(controller, method, _Asked(states[alive], log.now(alive), last, draws))
                 plans[alive] = found.x
                 log.plan(tau, alive, found.x, found.g, found.total_s, found.network_s)
                 stuck[alive] = found.missed
@@ -215,51 +215,56 @@ class _Found:
     network_s: float
 
 
-def _plan(
-    controller: Controller,
-    method: Method,
-    states: Array,
-    observed: Mapping[str, Array],
-    last: Array | None,
-    draws: Tensor,
-) -> _Found:
-    """Plans that begin at the states [n, dim], by the noise draws [n, count, horizon, dim]. Where one of several cannot be, the
-    others are made without it; one that cannot be is to stay where it is, and missed.
+class _Asked(NamedTuple):
+    """What plans of one control step begin from: states [n, dim], observed quantities [n], the last plans [n, horizon, dim] where
+    they are carried on, noise [n, count, horizon, dim].
     """
+
+    states: Array
+    observed: Mapping[str, Array]
+    last: Array | None
+    draws: Tensor
+
+    def one(self, i: int) -> "_Asked":
+        """The same of one episode."""
+        which = slice(i, i + 1)
+        seen = {name: values[which] for name, values in self.observed.items()}
+        return _Asked(self.states[which], seen, None if self.last is None else self.last[which], self.draws[which])
+
+    def bind(self, g: Constraint, controller: Controller) -> Constraint:
+        """g as it is now."""
+        seen = {name: torch.from_numpy(values) for name, values in self.observed.items()}
+        return g.bind(seen, controller.task.dt, controller.horizon)
+
+
+def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
+    """Plans for all. Where one of several cannot be, the others are made without it; one that cannot be is to stay where it is, and
+    missed.
+    """
+    began = time.perf_counter()
     try:
-        return _plan_together(controller, method, states, observed, last, draws)
+        return _plan_together(controller, method, asked)
     except InfeasibleError:
         if controller.brake is None:
             raise
-    n, began, each = len(states), time.perf_counter(), []
-    scored = controller.g.bind({k: torch.from_numpy(v) for k, v in observed.items()}, controller.task.dt, controller.horizon)
+    scored, n = asked.bind(controller.g, controller), len(asked.states)
     if n == 1:
-        return _Found(states[:, None].repeat(controller.horizon, 1), scored, np.ones(1, dtype=bool), 0.0, 0.0)
-    for i in range(n):
-        one, before = slice(i, i + 1), None if last is None else last[i : i + 1]
-        seen = {name: values[one] for name, values in observed.items()}
-        each.append(_plan(controller, controller.method, states[one], seen, before, draws[one]))
+        stay = asked.states[:, None].repeat(controller.horizon, 1)
+        return _Found(stay, scored, np.ones(1, dtype=bool), time.perf_counter() - began, 0.0)
+    each = [_plan(controller, controller.method, asked.one(i)) for i in range(n)]
     x, missed = np.concatenate([found.x for found in each]), np.concatenate([found.missed for found in each])
     return _Found(x, scored, missed, time.perf_counter() - began, sum(found.network_s for found in each))
 
 
-def _plan_together(
-    controller: Controller,
-    method: Method,
-    states: Array,
-    observed: Mapping[str, Array],
-    last: Array | None,
-    draws: Tensor,
-) -> _Found:
+def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Found:
+    states, _, last, draws = asked
     device, horizon, timed = controller.device, controller.horizon, Timed(controller.denoiser, controller.device)
     synchronise(device)
     began = time.perf_counter()
-
     with torch.inference_mode():
         here = torch.from_numpy(states)
         to = controller.frame.at(here)
-        seen = {name: torch.from_numpy(values) for name, values in observed.items()}
-        scored, obeyed = (g.bind(seen, controller.task.dt, horizon) for g in (controller.g, controller.enforced))
+        scored, obeyed = (asked.bind(g, controller) for g in (controller.g, controller.enforced))
         like = torch.empty(0, device=device)
         unit = torch.ones_like(to.scale)
         g = pull_back(obeyed, to.centre, unit).to(like)

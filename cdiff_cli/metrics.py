@@ -200,7 +200,7 @@ def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -
             "steps": float(count),
             "latency_ms": 1e3 * float(np.median(episodes.latency_s)),
             "latency_p95": 1e3 * float(np.quantile(episodes.latency_s, 0.95)),
-            "overhead": 100.0 * float(np.median(episodes.latency_s / episodes.network_s) - 1.0),
+            "overhead": 100.0 * float(np.median(episodes.latency_s) / max(np.median(episodes.network_s), 1e-9) - 1.0),
         }
         rows.append(row | {f"{name}s": float(np.nansum(told[i])) for name, told in episodes.info.items() if name == "contact"})
     return rows

@@ -219,6 +219,11 @@ def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     done = control(acting, [0], steps=5)
     assert (done.braked == 1).all()
     np.testing.assert_allclose(done.x[0, 1:, 1], 0.9 * done.x[0, :-1, 1], atol=1e-6)
+    (row,) = metrics.control_metrics(
+        done, metrics.executed_levels(never, done.x, done.observed, DT), (vec(-10).numpy(), vec(10).numpy())
+    )
+    assert row["braked"] == 100.0
+    assert np.isfinite([row["latency_ms"], row["overhead"]]).all()  # where no network call came through, too
     assert (control(replace(acting, enforced=LIMIT), [0], steps=5).braked == 0).all()
 
 

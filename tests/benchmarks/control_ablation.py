@@ -10,15 +10,13 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import yaml
+from acting import act
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli import metrics
 from cdiff_cli.closed_loop import controller
-from cdiff_cli.control import control
 from cdiff_cli.recipe import home
 from cdiff_cli.request import Options, resolve
 
@@ -74,19 +72,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = varied(change, Path(folder))
             acting = controller(resolve(Options(task="ball-run", method=method, constraints=path, settings=settings, margin=0.0)))
-        done = control(replace(acting, polish=False) if "squared" in name else acting, seeds, {"collide": False})
-        levels = metrics.executed_levels(truth, done.x, done.observed, acting.task.dt)
-        rows = metrics.control_metrics(done, levels, (-np.ones(2), np.ones(2)))
-        reward = np.array([row["reward"] for row in rows])
-        table.add_row(
-            name,
-            f"{reward.mean():.0f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.0f}",
-            f"{np.mean([row['violation_rate'] for row in rows]):.3f}",
-            f"{sum(row['safe_executed'] == 0 for row in rows)}",
-            f"{max(row['executed_worst'] for row in rows):.3f}",
-            f"{np.mean([row['saturation'] for row in rows]):.1f}",
-        )
-        Console(stderr=True).print(name, rows and f"{reward.mean():.0f}")
+        found = act(replace(acting, polish=False) if "squared" in name else acting, seeds, truth, {"collide": False})
+        rate, saturation = f"{found.mean('violation_rate'):.3f}", f"{found.mean('saturation'):.1f}"
+        table.add_row(name, found.returned(), rate, found.violating(), found.worst(), saturation)
+        Console(stderr=True).print(name, found.returned())
     Console(width=130).print(table)
 
 

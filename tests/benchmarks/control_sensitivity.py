@@ -17,13 +17,13 @@ mpl.use("Agg")
 import numpy as np
 import torch
 import yaml
+from acting import act
 from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli import metrics
 from cdiff_cli.closed_loop import controller
-from cdiff_cli.control import Controller, control
+from cdiff_cli.control import Controller
 from cdiff_cli.recipe import home
 from cdiff_cli.request import Options, resolve
 
@@ -64,23 +64,14 @@ def main() -> None:
         table.add_column(title, justify="left" if title == "change" else "right")
     figure, axis = plt.subplots(figsize=(8, 3.2))
     for name, changed in rows:
-        done = control(changed, seeds)
-        levels = metrics.executed_levels(own.g, done.x, done.observed, own.task.dt)
-        measured = metrics.control_metrics(done, levels, (-np.ones(done.u.shape[2]), np.ones(done.u.shape[2])))
-        reward, h = np.array([row["reward"] for row in measured]), -levels.max(-1)
+        found = act(changed, seeds, own.g)
+        h = -found.levels.max(-1)
         fall = np.nanmax((h[:, :-1] - h[:, 1:]) / np.maximum(h[:, :-1], 0.05))
-        table.add_row(
-            name,
-            f"{reward.mean():.0f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.0f}",
-            f"{np.mean([row['violation_rate'] for row in measured]):.3f}",
-            f"{np.mean([row['executed_violation'] for row in measured]):.3f}",
-            f"{max(row['executed_worst'] for row in measured):.3f}",
-            f"{fall:.2f}",
-            f"{done.fell.sum()}",
-        )
+        rate, total = f"{found.mean('violation_rate'):.3f}", f"{found.mean('executed_violation'):.3f}"
+        table.add_row(name, found.returned(), rate, total, found.worst(), f"{fall:.2f}", f"{found.done.fell.sum()}")
         if name.startswith("alpha"):
             axis.plot(np.arange(SHOWN) * own.task.dt, h[0, 500 : 500 + SHOWN], label=name, lw=1.2)
-        Console(stderr=True).print(name, f"{reward.mean():.0f}")
+        Console(stderr=True).print(name, found.returned())
     Console(width=130).print(table)
     axis.axhline(0, color="#d1495b", lw=1.2)
     axis.set(xlabel="time / s", ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit, by alpha")

@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from acting import act
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from cdiff_cli import metrics
 from cdiff_cli.closed_loop import controller
-from cdiff_cli.control import Controller, control
+from cdiff_cli.control import Controller
 from cdiff_cli.data import demonstrations, load_inputs
 from cdiff_cli.inverse import fit_inverse
 from cdiff_cli.recipe import InverseSpec
@@ -62,12 +62,8 @@ def main() -> None:
 
     def add(name: str, fits: tuple[str, str], changed: dict[str, Controller]) -> None:
         for method, acting in changed.items():
-            done = control(acting, range(asked.seed, asked.seed + asked.episodes), {"collide": False})
-            levels = metrics.executed_levels(acting.g, done.x, done.observed, task.dt)
-            rows = metrics.control_metrics(done, levels, (-np.ones(2), np.ones(2)))
-            reward, rate = np.array([r["reward"] for r in rows]), np.mean([r["violation_rate"] for r in rows])
-            spread = f"{reward.mean():.0f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.0f}"
-            table.add_row(name, *fits, method, spread, f"{rate:.3f}", f"{sum(r['safe_executed'] == 0 for r in rows)}")
+            found = act(acting, range(asked.seed, asked.seed + asked.episodes), acting.g, {"collide": False})
+            table.add_row(name, *fits, method, found.returned(), f"{found.mean('violation_rate'):.3f}", found.violating())
 
     for ahead in (1, 2, 4, 8):
         spec = InverseSpec(steps=8000, ahead=ahead)
