@@ -6,8 +6,9 @@ import torch
 
 from cdiff_cli.constraint import Constraint, Traj
 from cdiff_cli.diffusion import Step
-from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, split
+from cdiff_cli.dynamics import DYNAMICS_FROM, due, split
 from cdiff_cli.projection import ADMM_ROUNDS, project_from
+from cdiff_cli.reaching import Warm
 
 
 @dataclass(frozen=True)

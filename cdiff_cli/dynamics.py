@@ -1,26 +1,20 @@
-"""Linear dynamics with bounded inputs, and the nearest trajectory that they can produce.
+"""Linear dynamics with bounded inputs: what they make, their rows, fitting them.
 
     x^{tau+1} = A x^tau + B u^tau + c,   low <= u <= high
 
-The projection onto {dynamics, input box, half-spaces, segments outside balls, start and goal pinned} is solved by ADMM, the whole
-batch at once: the inputs u are the only unknowns (condensed), the dynamics hold exactly in every iterate, the box and the
-obstacles are met by copies of u and of the positions. One round is one product with a matrix that depends on the dynamics and
-the horizon alone, is computed once and shared by the batch, and one closed-form projection of the copies.
+The nearest trajectory that they make is found in reaching.py.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cdiff_cli.constraint import Constraint, Part, Pins, Pull, Rows, Segments, Traj, Waypoints
+from cdiff_cli.constraint import Constraint, Part, Pull, Rows, Traj
 from cdiff_cli.levels import each_end, take
-from cdiff_cli.segments import nearest_in_planes, planes
 
 Array = NDArray[np.float64]
 DYNAMICS_FROM = 0.995
@@ -50,10 +44,11 @@ class LinearDynamics:
 
     def rollout(self, x0: Tensor, u: Tensor) -> Traj:
         """States from x0 [batch, n] under the inputs u [batch, horizon - 1, m]: [batch, horizon, n]."""
-        states = [x0]
-        for tau in range(u.shape[1]):
-            states.append(self(states[-1], u[:, tau]))
-        return torch.stack(states, 1)
+        x, power, reach = torch.cat((x0[:, None], u @ self.B.T + self.c), 1), self.A, 1
+        while reach < x.shape[1]:  # each state then holds what its last `reach` steps contribute
+            x = torch.cat((x[:, :reach], x[:, reach:] + x[:, :-reach] @ power.T), 1)
+            power, reach = power @ power, 2 * reach
+        return x
 
     def wanted(self, x: Traj) -> Tensor:
         """The inputs that come closest to producing x, whatever their size [batch, horizon - 1, m]."""
@@ -180,142 +175,3 @@ def fit(x: Array, u: Array, after: Array) -> tuple[LinearDynamics, float]:
     low, high = u.min(0), u.max(0)
     found = LinearDynamics(*(torch.from_numpy(np.ascontiguousarray(v)) for v in (A, B, c[:, 0], low, high)))
     return found, float((miss <= 1e-4).mean())
-
-
-class Warm(NamedTuple):
-    """Where ADMM stands: copies and scaled multipliers of the inputs and of the constrained coordinates, and the inputs u.
-
-    w_u, y_u, u [batch, horizon - 1, m], w_p, y_p [copies, batch, horizon, k]
-    """
-
-    w_u: Tensor
-    y_u: Tensor
-    w_p: Tensor
-    y_p: Tensor
-    u: Tensor
-
-    def of(self, which: Tensor) -> "Warm":
-        """Of some trajectories of the batch alone."""
-        return Warm(self.w_u[which], self.y_u[which], self.w_p[:, which], self.y_p[:, which], self.u[which])
-
-
-RHO_U, RHO_P = 0.02, 5.0  # weights of the copies of u and of positions
-RELAXATION = 1.6
-TURNS = (0, 10, 20, 40)  # rounds before which the tangent planes (segments.py) are chosen anew; then they rest, to converge
-
-
-def nearest_reachable(
-    dynamics: LinearDynamics,
-    parts: Sequence[Waypoints | Segments],
-    rest: Callable[[Traj, Pins], Traj] | None,
-    z: Traj,
-    pins: Pins,
-    *,
-    used: Sequence[int],
-    weight: Tensor,
-    rounds: int,
-    warm: Warm | None = None,
-    tolerance: float = 0.0,
-) -> tuple[Traj, Warm]:
-    """The trajectory nearest to z, |x - z|^2 weighted by coordinate, that the dynamics produce from the first state of z under
-    bounded inputs, with the parts (affine at waypoints, balls on segments) obeyed and a pinned last state reached.
-
-    parts, rest  act on the coordinates `used` alone; rest is the projection onto whatever else is to hold, or None
-    weight      of each coordinate in the distance   [n]
-    rounds      of ADMM at most; it stops where every copy is within `tolerance` of the trajectory
-    """
-    used, ends = tuple(used), bool(pins.mask[-1].all())
-    copies = (len(parts) > 0) + (rest is not None)
-    numbers = tuple(tuple(v.flatten().tolist()) for v in (dynamics.A, dynamics.B, dynamics.c))
-    f = _factor(numbers, z.shape[1], used, copies, ends, tuple(weight.tolist()), z.dtype, z.device)
-    held = Pins(pins.mask[:, used], z[..., used])
-    drift = (z[:, 0] @ f.F.T + f.offset).reshape(z.shape)  # where no input leads
-    u_base = ((z - drift) * weight).flatten(1) @ f.G @ f.S.T
-    if ends:
-        u_base = u_base + (z[:, -1] - drift[:, -1]) @ f.S_e.T
-    p_base, p_drift = u_base @ f.PG.T, drift[..., used]
-    u_shape, p_shape = (len(z), z.shape[1] - 1, len(dynamics.low)), (len(z), z.shape[1], len(used))
-    w_u, y_u, w_p, y_p, u = warm or _cold(dynamics, z, used, copies)
-    at = z[..., used]
-    for k in range(rounds):
-        if parts and k in TURNS:
-            halfspaces = planes(parts, at, held)
-        push = (w_p - y_p).sum(0) - copies * p_drift
-        pushes = torch.cat((RHO_U * (w_u - y_u).flatten(1), RHO_P * push.flatten(1)), 1)
-        u = (u_base + pushes @ f.K_u.T).reshape(u_shape)
-        at = (p_base + pushes @ f.K_p.T).reshape(p_shape) + p_drift
-        over = RELAXATION * u + (1 - RELAXATION) * w_u + y_u
-        w_u = torch.clamp(over, dynamics.low, dynamics.high)
-        y_u = over - w_u
-        if copies:
-            over = RELAXATION * at + (1 - RELAXATION) * w_p + y_p
-            each = [nearest_in_planes(over[0], halfspaces, held)] if parts else []
-            w_p = torch.stack([*each, rest(over[-1], held)] if rest else each)
-            y_p = over - w_p
-        if tolerance and k % 5 == 4 and _gap(u - w_u) < tolerance and _gap(at - w_p) < tolerance:
-            break
-    return drift + (u.flatten(1) @ f.G.T).reshape(z.shape), Warm(w_u, y_u, w_p, y_p, u)
-
-
-def _cold(dynamics: LinearDynamics, z: Traj, used: tuple[int, ...], copies: int) -> Warm:
-    """ADMM at z itself, with no multipliers."""
-    u, p = dynamics.inputs(z), z[..., used].expand(copies, -1, -1, -1)
-    return Warm(u, torch.zeros_like(u), p, torch.zeros_like(p), u)
-
-
-def _gap(x: Tensor) -> float:
-    return float(x.abs().max()) if x.numel() else 0.0
-
-
-class _Factor(NamedTuple):
-    """Matrices of one problem shape: x = F x0 + offset + G u; u = S r + S_e e minimises the quadratic part for the right-hand
-    side r under the equality of the last state; K maps the pushes of the copies to u and to the positions.
-    """
-
-    F: Tensor
-    offset: Tensor
-    G: Tensor
-    PG: Tensor
-    S: Tensor
-    S_e: Tensor
-    K_u: Tensor
-    K_p: Tensor
-
-
-@lru_cache(maxsize=8)
-def _factor(
-    numbers: tuple[tuple[float, ...], ...],
-    horizon: int,
-    used: tuple[int, ...],
-    copies: int,
-    ends: bool,
-    weight: tuple[float, ...],
-    dtype: torch.dtype,
-    device: torch.device,
-) -> _Factor:
-    n, steps = len(weight), horizon - 1
-    A, B, c = (torch.tensor(values, dtype=torch.float64) for values in numbers)
-    A, B = A.reshape(n, n), B.reshape(n, -1)
-    m = B.shape[1]
-    power = [torch.eye(n, dtype=torch.float64)]
-    offset = [torch.zeros(n, dtype=torch.float64)]
-    for _ in range(steps):
-        power.append(A @ power[-1])
-        offset.append(A @ offset[-1] + c)
-    response = (torch.stack(power) @ B)[:steps]  # of x^{tau+1+k} to u^tau
-    G = torch.zeros(horizon, n, steps, m, dtype=torch.float64)
-    for tau in range(1, horizon):
-        G[tau, :, :tau] = response[:tau].flip(0).transpose(0, 1)
-    PG = G[:, used].reshape(horizon * len(used), steps * m)
-    last = G[-1].reshape(n, steps * m)
-    flat = G.reshape(horizon * n, steps * m)
-    heavy = torch.tensor(weight, dtype=torch.float64).repeat(horizon)[:, None]
-    M = flat.T @ (heavy * flat) + RHO_U * torch.eye(steps * m, dtype=torch.float64) + copies * RHO_P * PG.T @ PG
-    S = torch.cholesky_inverse(torch.linalg.cholesky(M))
-    S_e = torch.zeros(steps * m, n, dtype=torch.float64)
-    if ends:
-        S_e = S @ last.T @ torch.linalg.pinv(last @ S @ last.T)
-        S = S - S_e @ last @ S
-    K_u = torch.cat((S, S @ PG.T), 1)
-    made = (torch.cat(power), torch.cat(offset), flat, PG, S, S_e, K_u, PG @ K_u)
-    return _Factor(*(v.to(device, dtype) for v in made))

@@ -23,9 +23,10 @@ from torch.nn import functional as F
 from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
 from cdiff_cli.constraint import Constraint, Pins, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
+from cdiff_cli.dynamics import DYNAMICS_FROM, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
+from cdiff_cli.reaching import Warm
 from cdiff_cli.safediffuser import SafeDiffuser
 from cdiff_cli.segments import turned
 

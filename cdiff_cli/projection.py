@@ -24,9 +24,10 @@ from cdiff_cli.approach import Approach
 from cdiff_cli.chains import nearest_on_chain
 from cdiff_cli.closed_forms import nearest
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
-from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
+from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
+from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import goes_round, nearest_in_planes, planes
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
@@ -64,10 +65,11 @@ def project_from(
 def _reach(
     part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float
 ) -> tuple[Traj, Warm | None]:
-    """ADMM in environment units on the coordinates that the other parts constrain."""
+    """In environment units, in float64, the other parts on the coordinates that they constrain alone."""
+    kind, z, part = z, z.double(), part.to(z.double())
     back = (-part.centre / part.scale, 1 / part.scale)
     used = _coordinates(others, z.shape[-1])
-    narrow = [_restricted(other.pull_back(*back), used) for other in others]
+    narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
     rest = Constraint(tuple(other for other in narrow if not tangible(other)))
     x, warm = nearest_reachable(
@@ -75,14 +77,15 @@ def _reach(
         around,
         (lambda p, held: _project(rest, p, held, False)) if rest.parts else None,
         part.decode(z),
-        Pins(pins.mask, part.decode(pins.values)),
+        Pins(pins.mask, part.decode(pins.values.to(z))),
         used=used,
         weight=part.weight,
         rounds=rounds,
+        turns=max(1, min(REFINEMENTS, rounds // 10)),
         warm=warm,
         tolerance=tolerance,
     )
-    return pins.paint(part.encode(x)), warm
+    return pins.paint(part.encode(x).to(kind)), warm
 
 
 def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:

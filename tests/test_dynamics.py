@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdiff_cli.constraint import Chain, Constraint, Pins, Segments, Waypoints
-from cdiff_cli.dynamics import LinearDynamics, Reachable, dynamics_of, fit, nearest_reachable, split
+from cdiff_cli.dynamics import LinearDynamics, Reachable, dynamics_of, fit, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.planning import CLEARANCE
 from cdiff_cli.projection import project, project_from
+from cdiff_cli.reaching import nearest_reachable
 from tests.problems import F64, ball, normal, num, pin, saddle, vec
 
 seeds = st.integers(0, 10_000)
