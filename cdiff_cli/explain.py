@@ -49,7 +49,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
-            "exact" if has_exact_form(form) else "ADMM" if isinstance(form, Reachable) else "sequential (ProxQP)",
+            "exact" if has_exact_form(form) else "active set" if isinstance(form, Reachable) else "sequential (ProxQP)",
             obey,
         )
     out.print(table)

@@ -55,7 +55,7 @@ class Projected:
 
     correction     on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
                    x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
-    rounds         of ADMM a step where dynamics are to be obeyed, from where the step before ended; other projections are exact
+    rounds         for dynamics (projection.py): a choice of tangent planes for each ten, of ADMM where that is needed
     dynamics_from  they are obeyed once sqrt(alpha_bar_{t-1}) is at least this
     """
 
@@ -86,8 +86,7 @@ class PrimalDual:
     estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
-    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
-    `rounds` rounds of ADMM.
+    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone.
 
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
@@ -127,7 +126,7 @@ class PrimalDual:
 
 
 class AlmState(NamedTuple):
-    """Multipliers [batch or 1, n] and the penalty weight; where dynamics are obeyed, those of ADMM."""
+    """Multipliers [batch or 1, n] and the penalty weight; where dynamics are obeyed, where their projection ended."""
 
     lam: Rows
     rho: float
@@ -145,8 +144,8 @@ class AugmentedLagrangian:
             x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
     lam_{t-1} = m,  rho_{t-1} = c rho_t
 
-    With dynamics among the constraints, `clean` is ADMM, the augmented Lagrangian of the split problem (dynamics.py): `rounds`
-    rounds a step, its multipliers carried from step to step.
+    With dynamics among the constraints, `clean` maximises over the multipliers instead of climbing: the exact projection
+    (reaching.py), which starts from the rows that were active a step before.
 
     rho          first penalty weight; on clean in units of the exact one, kept at most 1, where one half-space is met at once
     c            its growth a step

@@ -22,7 +22,7 @@ from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
 MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
-CLEARANCE = 5e-3  # the same where dynamics are obeyed: ADMM ends near the set, and the execution near the plan
+CLEARANCE = 5e-3  # the same where dynamics are obeyed: the execution stays near the plan, not on it
 
 
 @dataclass(frozen=True)

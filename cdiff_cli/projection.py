@@ -5,7 +5,7 @@
 half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression, or of high order a small QP (chains.py)
-linear dynamics with bounded inputs, and any of these    ADMM on the inputs (dynamics.py), a local solution
+linear dynamics with bounded inputs, and any of these    active set (reaching.py), ADMM for what has no rows; a local solution
 several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
@@ -48,8 +48,10 @@ def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
 def project_from(
     g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float = 1e-3, strict: bool = False
 ) -> tuple[Traj, Warm | None]:
-    """The same, where dynamics are to be obeyed in that many rounds of ADMM, or as many as bring its copies within the
-    tolerance (units of the inputs, and environment units), from where the last call ended.
+    """The same, where dynamics are to be obeyed to the tolerance (units of the inputs, and environment units), from where the last
+    call ended, the tangent planes chosen once for ten rounds, at most REFINEMENTS times.
+
+    rounds   of ADMM at most, where one of the parts is met with dynamics by its projection alone (reaching.py)
 
     strict   raise where nothing feasible was found; otherwise, as within sampling, where the next estimate may be easier, return
              the best point that the tangent planes of segments gave

@@ -17,12 +17,14 @@ from torch import Tensor
 
 from cdiff_cli.constraint import Constraint, Pins, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import LinearDynamics
+from cdiff_cli.levels import Affine
 from cdiff_cli.segments import NEVER, planes
 from cdiff_cli.tracking import Tracking, tracking
 
-GIVE_U, GIVE_P = 5e-8, 2e-10  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
-PATIENCE = 5  # pivots without fewer wrong rows before they go one at a time
-PIVOTS = 500
+GIVE_U, GIVE_P = 5e-4, 2e-6  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
+REFINED = 3  # solutions of a system, the later ones from where the one before gave way: rows that can be met then are, to rounding
+PIVOTS, PATIENCE = 150, 20  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
+RUN = 8  # waypoints on either side among which one half-space enters at once, the one that is violated most
 RHO, RELAXATION = 5.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
 
@@ -63,9 +65,10 @@ def nearest_reachable(
 
     parts, rest  act on the coordinates `used` alone; rest is the projection onto whatever else is to hold, or None
     weight       of each coordinate in the distance   [n]
-    rounds       of the active set at most; with `rest`, of ADMM around it
-    turns        times at most that a plan's tangent planes (segments.py) are chosen, each time at the last result
-    tolerance    violation that is let pass
+    rounds       of ADMM at most, where there is `rest`; it stops where the copy is within the tolerance
+    turns        times at most that a plan's tangent planes (segments.py) are chosen: first at z where that is unsafe, then at the
+                 last result; a plan that needs none has none
+    tolerance    violation of a row that is let pass
     """
     (batch, horizon, n), m = z.shape, dynamics.B.shape[1]
     where, held = list(used), Pins(pins.mask[:, used], z[..., used].double())
@@ -75,11 +78,11 @@ def nearest_reachable(
         warm = Warm(active, dynamics.inputs(z).double(), held.values, torch.zeros_like(held.values))
     if batch == 0 or horizon == 1:
         return z, warm
-    target, heavy = x, weight.double().tolist()
-    heavy = [h + RHO * (rest is not None and i in used) for i, h in enumerate(heavy)]
+    heavy = tuple(v + RHO * (rest is not None and i in used) for i, v in enumerate(weight.tolist()))
     numbers = tuple(tuple(v.flatten().tolist()) for v in (dynamics.A, dynamics.B, dynamics.c))
-    track = tracking(numbers, tuple(heavy), horizon - 1, bool(pins.mask[-1].all()), z.device)
+    track = tracking(numbers, heavy, horizon - 1, bool(pins.mask[-1].all()), z.device)
     active, _, copy, push = warm
+    active = active.clone()
     g, at, free = Constraint(tuple(parts)), held.values, ~held.mask[1:].any(1)
     rows = Bounds(dynamics.low.double(), dynamics.high.double(), where, max(tolerance, 1e-9))
     a = x.new_zeros(batch, horizon - 1, slots, len(where))
@@ -96,10 +99,8 @@ def nearest_reachable(
             b[which] = torch.where(free[:, None], bound[:, 1:], NEVER)
             walled = walled | touched
         if rest or k == 0:
-            if rest:
-                target = x.index_copy(2, track.weight.new_tensor(where).long(), held.values)
-                target = _toward(x, weight.double(), copy - push, where)
-            w0 = track.solve(target, torch.zeros_like(w))
+            w0 = track.solve(_toward(x, weight.double(), copy - push, where) if rest else x, torch.zeros_like(w))
+        active[..., m:] *= b < NEVER  # a warm start may know rows that are not there now
         w[some], active[some] = settle(track, w0[some], rows, a[some], b[some], active[some])
         at = torch.cat((held.values[:, :1], w[..., where]), 1)
         unsafe = (g(at) > rows.tolerance).any(1)
@@ -107,11 +108,11 @@ def nearest_reachable(
             over = RELAXATION * at + (1 - RELAXATION) * copy + push
             copy = rest(over, held)
             push = over - copy
-            touched = (walled | unsafe) if k + 1 in TURNS else unsafe & ~walled
+            touched = unsafe & ~walled | walled & (k + 1 in TURNS)
             if tolerance and k % 5 == 4 and float((at - copy).abs().max()) < tolerance:
                 break
             continue
-        touched = (unsafe & ~walled) | walled if k + 1 < turns else unsafe & ~walled
+        touched = unsafe & ~walled | walled & (k + 1 < turns)
         some = touched.nonzero()[:, 0]
         if not len(some):
             break
@@ -120,7 +121,8 @@ def nearest_reachable(
 
 
 def _slots(parts: Sequence[Waypoints | Segments]) -> int:
-    return sum(1 if isinstance(part, Waypoints) else 2 for part in parts)
+    """Half-spaces a waypoint that planes() makes of the parts."""
+    return sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
 
 
 def _toward(z: Tensor, weight: Tensor, pull: Tensor, used: list[int]) -> Tensor:
@@ -156,7 +158,7 @@ def settle(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, ac
     for _ in range(PIVOTS):
         was, push = active[todo], y[todo]
         over = _over(w[todo], bounds, a[todo], b[todo])
-        enter = torch.where(was == 0, over.sign().to(torch.int8), 0)
+        enter = _foremost(torch.where(was == 0, over, 0.0), len(bounds.low)).sign().to(torch.int8)
         asked = torch.where(was * push > 0, was, enter)
         wrong = (asked != was).flatten(1).sum(1)
         open_ = wrong > 0
@@ -182,6 +184,17 @@ def _over(w: Tensor, bounds: Bounds, a: Tensor, b: Tensor) -> Tensor:
     if a.shape[2]:
         over = torch.cat((over, ((a * w[..., None, bounds.used]).sum(-1) - b).clamp_min(0)), 2)
     return torch.where(over.abs() > eps, over, 0.0)
+
+
+def _foremost(over: Tensor, m: int) -> Tensor:
+    """The violations of inputs, and of the half-spaces those that no neighbour in time exceeds: neighbours share one cause, and one
+    row in the middle of them often cures it.
+    """
+    if over.shape[2] == m:
+        return over
+    walls = over[..., m:]
+    most = torch.nn.functional.max_pool1d(walls.transpose(1, 2), 2 * RUN + 1, 1, RUN).transpose(1, 2)
+    return torch.cat((over[..., :m], torch.where(walls >= most, walls, 0.0)), 2)
 
 
 def _one_at_a_time(active: Tensor, y: Tensor, kept: Tensor, over: Tensor, enter: Tensor) -> tuple[Tensor, Tensor]:
@@ -237,7 +250,9 @@ def _at_active(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor
     Q.diagonal(dim1=1, dim2=2).add_(give)
     size = Q.diagonal(dim1=1, dim2=2).rsqrt()
     factor = torch.linalg.cholesky_ex(Q * size[:, :, None] * size[:, None])[0]
-    multiplier = size * torch.cholesky_solve((size * wanted)[..., None], factor)[..., 0]
+    multiplier = torch.zeros_like(wanted)
+    for _ in range(REFINED):
+        multiplier = size * torch.cholesky_solve((size * (wanted + give * multiplier))[..., None], factor)[..., 0]
     pull = w0.new_zeros(batch, steps * width)
     pull.scatter_add_(1, at.flatten(1), (-multiplier[..., None] * coefficient).flatten(1))
     y[plan, row] = multiplier[plan, slot]

@@ -23,9 +23,9 @@ class Tracking(NamedTuple):
     """K = blockdiag(near) + far link far^T, over w = (x^{tau+1}, u^tau) for each step tau, padded to whole pieces.
 
     near [pieces, p, p], far [pieces, p, 2 n], link [pieces * 2 n, pieces * 2 n], p = PIECE * (n + m)
-    from_start, from_end, offset   a trajectory that the dynamics make, by the pinned states   [steps * (n + m), n], [steps * (n + m)]
-    weight                         of w in the cost   [n + m]
-    variance                       diagonal of K   [steps, n + m]
+    from_start, from_end   a trajectory that the dynamics make, by the pinned states   [steps * (n + m), n]
+    offset                 what c adds to it   [steps * (n + m)]
+    weight                 of w in the cost   [n + m]
     """
 
     near: Tensor
@@ -35,7 +35,6 @@ class Tracking(NamedTuple):
     from_end: Tensor
     offset: Tensor
     weight: Tensor
-    variance: Tensor
 
     def solve(self, z: Tensor, f: Tensor) -> Tensor:
         """The solution for targets z [batch, horizon, n] and costs f [batch, steps, n + m]: w, [batch, steps, n + m]."""
@@ -132,10 +131,8 @@ def tracking(
         offset = offset - from_end @ offset[last]
         free = free - from_end @ free[last]
     far = torch.cat((enter, leave), 2)
-    variance = near.diagonal(dim1=1, dim2=2) + (far @ _own_links(link, pieces) * far).sum(2)
     heavy = torch.cat((W.diagonal(), ridge.diagonal()))
-    made = (near, far, link, free, from_end, offset, heavy, variance.flatten()[: len(free)].view(steps, n + m).clamp_min(0))
-    return Tracking(*(v.to(device) for v in made))
+    return Tracking(*(v.to(device) for v in (near, far, link, free, from_end, offset, heavy)))
 
 
 def _closed_loop(A: Tensor, B: Tensor, W: Tensor, ridge: Tensor, steps: int) -> tuple[list[Tensor], list[Tensor]]:
@@ -161,9 +158,3 @@ def _links(through: Tensor) -> Tensor:
             link[j, 1, :, i, 0] = on.T
             on = through[i] @ on
     return link.view(pieces * 2 * n, -1)
-
-
-def _own_links(link: Tensor, pieces: int) -> Tensor:
-    """The diagonal blocks [pieces, 2 n, 2 n]."""
-    rank = len(link) // pieces
-    return link.view(pieces, rank, pieces, rank).diagonal(dim1=0, dim2=2).permute(2, 0, 1)

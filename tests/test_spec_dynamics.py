@@ -233,6 +233,6 @@ def test_check_shows_dynamics(entry, tmp_path, monkeypatch):
     cdiff_cli.explain.explain(tmp_path / "own.yaml", tmp_path / "own.png", out)
     text = out.export_text()
     assert "each step obeys x' = A x + B u + c" in text
-    assert "ADMM" in text
+    assert "active set" in text
     assert "127" in text  # a row a step
     assert (tmp_path / "own.png").exists()
