@@ -23,7 +23,7 @@ from cdiff_cli.tracking import Tracking, tracking
 
 GIVE_U, GIVE_P = 5e-4, 2e-6  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
 REFINED = 3  # solutions of a system, the later ones from where the one before gave way: rows that can be met then are, to rounding
-PIVOTS, PATIENCE = 150, 20  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
+PIVOTS, PATIENCE = 200, 20  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
 RUN = 8  # waypoints on either side among which one half-space enters at once, the one that is violated most
 RHO, RELAXATION = 5.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
