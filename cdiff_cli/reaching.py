@@ -23,7 +23,8 @@ from cdiff_cli.tracking import Tracking, tracking
 
 GIVE_U, GIVE_P = 5e-4, 2e-6  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
 REFINED = 3  # solutions of a system, the later ones from where the one before gave way: rows that can be met then are, to rounding
-PIVOTS, PATIENCE = 200, 20  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
+PIVOTS, PATIENCE = 200, 12  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
+CONTRADICTED = 1e-3  # violation of active rows that all push: no trajectory meets them together (Farkas), and the search ends
 RUN = 8  # waypoints on either side among which one half-space enters at once, the one that is violated most
 RHO, RELAXATION = 5.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
@@ -161,7 +162,9 @@ def settle(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, ac
         enter = _foremost(torch.where(was == 0, over, 0.0), len(bounds.low)).sign().to(torch.int8)
         asked = torch.where(was * push > 0, was, enter)
         wrong = (asked != was).flatten(1).sum(1)
-        open_ = wrong > 0
+        contradicted = torch.where(was == 0, 0.0, over).abs().flatten(1).amax(1) > CONTRADICTED
+        proved = contradicted & ~((was != 0) & (was * push <= 0)).flatten(1).any(1)
+        open_ = (wrong > 0) & ~proved
         if not bool(open_.any()):
             break
         if not bool(open_.all()):

@@ -11,6 +11,7 @@ solution (ProxQP: primal). Cost: paths under smooth random inputs with a disc on
 import argparse
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def halfspaces(parts, z, mask):
 
 
 def proxqp(d, weight, z, a, b):
-    """The problem of one plan [horizon, n] as qpsolvers takes it: states and inputs as unknowns, dynamics and ends as equalities."""
+    """The problem of one plan [horizon, n] for qpsolvers: states and inputs as unknowns, dynamics and ends as equalities."""
     (horizon, n), m = z.shape, d.B.shape[1]
     steps = horizon - 1
     makes = sparse.kron(sparse.eye(steps, horizon, k=1), sparse.eye(n)) - sparse.kron(sparse.eye(steps, horizon), d.A.numpy())
@@ -177,9 +178,9 @@ def against_solvers(batches, repeats):
             z = windows[torch.arange(batch) % len(windows)]
             pins, normal = Pins(mask, z), problem.normaliser.encode(z).float()
             _, state = ours(d, parts, weight, z, pins)
-            mine = milliseconds(lambda z=z, pins=pins: ours(d, parts, weight, z, pins), repeats) / batch
-            again = milliseconds(lambda z=z, pins=pins, state=state: ours(d, parts, weight, z + bump, pins, state), repeats) / batch
-            network = milliseconds(lambda normal=normal: problem.denoiser(normal, 10), 3) / batch
+            mine = milliseconds(partial(ours, d, parts, weight, z, pins), repeats) / batch
+            again = milliseconds(partial(ours, d, parts, weight, z + bump, pins, state), repeats) / batch
+            network = milliseconds(partial(problem.denoiser, normal, 10), 3) / batch
             costs[horizon, batch] = (batch * mine, batch * again, batch * network)
             cells = [
                 f"{network:.2f}",
@@ -190,7 +191,7 @@ def against_solvers(batches, repeats):
             ]
             if batch * horizon <= 4000:  # beyond, minutes
                 a, b = halfspaces(parts, z, mask)
-                ms = milliseconds(lambda z=z, a=a, b=b: dense.interior_point(z, a, b), 1) / batch
+                ms = milliseconds(partial(dense.interior_point, z, a, b), 1) / batch
                 cells.append(f"{ms:.1f} ({ms / mine:.0f})")
             table.add_row(str(horizon), str(batch), *cells)
     Console(width=150).print(table)
@@ -223,7 +224,7 @@ def by_horizon(repeats):
         mask = torch.zeros(z.shape[1:], dtype=torch.bool)
         mask[0] = mask[-1] = True
         pins = Pins(mask, z)
-        mine = milliseconds(lambda z=z, disc=disc, pins=pins: ours(d, (disc,), weight, z, pins), repeats) / 16
+        mine = milliseconds(partial(ours, d, (disc,), weight, z, pins), repeats) / 16
         theirs = float("nan")
         if horizon <= 256:  # beyond, most of a minute a plan
             a, b = halfspaces((disc,), z, mask)
