@@ -51,8 +51,9 @@ def test_a_problem_with_half_of_its_rows_active_is_solved_from_nothing(seed):
 def test_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
     d = maze()
     _, z = noisy_path(d, 5, 3, 16)
-    z[:, 0, :2] = -0.05
+    z[:, 0, :2] = -0.2
     expected, _ = solve(d, z, pin(z, 0), [wall(0.0)])
+    assert float((expected @ WALL).max()) <= 1e-8
     monkeypatch.setattr("cdiff_cli.reaching.PATIENCE", -1)
     x, _ = solve(d, z, pin(z, 0), [wall(0.0)])
     torch.testing.assert_close(x, expected, atol=1e-6, rtol=0)
