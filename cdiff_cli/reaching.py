@@ -163,7 +163,7 @@ def settle(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, ac
         asked = torch.where(was * push > 0, was, enter)
         wrong = (asked != was).flatten(1).sum(1)
         contradicted = torch.where(was == 0, 0.0, over).abs().flatten(1).amax(1) > CONTRADICTED
-        proved = contradicted & ~((was != 0) & (was * push <= 0)).flatten(1).any(1)
+        proved = contradicted & (left[todo] < 0) & ~((was != 0) & (was * push <= 0)).flatten(1).any(1)
         open_ = (wrong > 0) & ~proved
         if not bool(open_.any()):
             break
