@@ -75,13 +75,14 @@ def main() -> None:
         f"{arguments.task}, batch {arguments.n}, {arguments.steps} steps, median of {arguments.repeats}, "
         f"{torch.get_num_threads()} threads\n"
     )
-    print("| method | preset | step / ms | of these in the network | of diffuser | paper: s | paper: of Diffuser |")
-    print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
+    print("| method | preset | step / ms | network | over its network | of diffuser | paper: s | paper: of Diffuser |")
+    print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     for (name, preset), measured in times.items():
         total, network = (statistics.median(column) for column in zip(*measured, strict=True))
         method = name.partition(" ")[0]
         theirs = (f"{paper[method] / 1e3:.4f}", f"{paper[method] / paper['diffuser']:.2f}") if method in paper else ("", "")
-        print(f"| {name} | {preset} | {total:.2f} | {network:.2f} | {total / base:.2f} | {theirs[0]} | {theirs[1]} |")
+        ratios = f"{total / network:.2f} | {total / base:.2f}"
+        print(f"| {name} | {preset} | {total:.2f} | {network:.2f} | {ratios} | {theirs[0]} | {theirs[1]} |")
 
 
 if __name__ == "__main__":
