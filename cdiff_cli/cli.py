@@ -107,11 +107,9 @@ def train(
     plan = load_recipe(task)
     condition = None
     if conditional is not None:
-        from cdiff_cli.conditioning import Condition, content_sha256
-        from cdiff_cli.spec import load_constraints
+        from cdiff_cli.conditioning import Condition
 
-        kinds, g = load_constraints(conditional, problem.name, problem.layout)
-        condition = Condition(conditional.stem, g, content_sha256(kinds))
+        condition = Condition.read(conditional, problem)
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe
     work = runs / f"train-{task}-{name}-{seed}"

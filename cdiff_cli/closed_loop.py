@@ -103,6 +103,7 @@ def controller(resolved: Resolved) -> Controller:
     return Controller(
         task=cast(ControlTask, problem.task),
         denoiser=resolved.guided or problem.denoiser,
+        seeing=resolved.seeing,
         schedule=problem.schedule,
         frame=checkpoint.frame,
         inverse=checkpoint.inverse,

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cdiff_cli.conditioning import Seeing
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
 from cdiff_cli.episodes import Episodes, Log
@@ -17,6 +18,7 @@ from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
 from cdiff_cli.methods import AlmState
 from cdiff_cli.networks import InverseDynamics
+from cdiff_cli.observed import Seen
 from cdiff_cli.planning import MARGIN, Timed, synchronise
 from cdiff_cli.projection import project_from
 from cdiff_cli.tasks import ControlTask
@@ -29,6 +31,7 @@ TOLERANCE = 1e-3  # of a finished plan's g, environment units: beyond it the pro
 class Controller:
     """All that acting needs, resolved.
 
+    seeing        the denoiser of a planner that is told what is observed, anew at each plan; None of the others
     g             as declared: what is scored                                    environment units
     enforced      what plans obey: g, tightened by the margin                    environment units
     temperature   factor on all noise: below 1 plans stay nearer the mean
@@ -59,6 +62,7 @@ class Controller:
     warm: float | None = None
     brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
+    seeing: Seeing | None = None
 
     @property
     def horizon(self) -> int:
@@ -231,10 +235,13 @@ class _Asked(NamedTuple):
         seen = {name: values[which] for name, values in self.observed.items()}
         return _Asked(self.states[which], seen, None if self.last is None else self.last[which], self.draws[which])
 
+    @property
+    def seen(self) -> Seen:
+        return {name: torch.from_numpy(values) for name, values in self.observed.items()}
+
     def bind(self, g: Constraint, controller: Controller) -> Constraint:
         """g as it is now."""
-        seen = {name: torch.from_numpy(values) for name, values in self.observed.items()}
-        return g.bind(seen, controller.task.dt, controller.horizon)
+        return g.bind(self.seen, controller.task.dt, controller.horizon)
 
 
 def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
@@ -258,11 +265,12 @@ def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
 
 def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Found:
     states, _, last, draws = asked
-    device, horizon, timed = controller.device, controller.horizon, Timed(controller.denoiser, controller.device)
+    device, horizon = controller.device, controller.horizon
     synchronise(device)
     began = time.perf_counter()
     with torch.inference_mode():
         here = torch.from_numpy(states)
+        timed = Timed(controller.denoiser if controller.seeing is None else controller.seeing(asked.seen, here), device)
         to = controller.frame.at(here)
         scored, obeyed = (asked.bind(g, controller) for g in (controller.g, controller.enforced))
         like = torch.empty(0, device=device)

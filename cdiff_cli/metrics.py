@@ -114,9 +114,10 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),
         "violation_paper": violation(g, x) * paper_units.violation,
-        "distance_paper": distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power),
         "jump": jump(x, at),
     }
+    if len(x) > 1:  # a single plan is its own mean
+        columns["distance_paper"] = distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power)
     if task.velocities:
         rate = [task.layout.index(name) for name in task.velocities]
         columns |= {

@@ -167,6 +167,7 @@ class Card(Strict):
 
     inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
     constraints   hash of the constraints that a conditional planner was trained for; None of the others
+    observed      quantities that it is told, besides
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -191,6 +192,7 @@ class Card(Strict):
     linear: float | None = None
     inverse: dict[str, float] | None = None
     constraints: str | None = None
+    observed: tuple[str, ...] = ()
 
 
 def home() -> Path:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.baselines import Conditional
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.conditioning import content_sha256, guided
+from cdiff_cli.conditioning import Seeing, content_sha256, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
@@ -87,9 +87,19 @@ class Resolved:
     @property
     def guided(self) -> Denoiser | None:
         """The clean estimate of a conditional planner; None of the other methods."""
+        return None if self.conditional is None else self._guided(self.conditional, None)
+
+    @property
+    def seeing(self) -> Seeing | None:
+        """The same of a planner that is told what it observes; None of the others."""
         planner = self.conditional
-        limit = 1.0 if planner is None or planner.frame is None else RELATIVE_LIMIT
-        return None if planner is None else guided(planner.net, self.settings["weight"], limit)
+        if planner is None or (telling := planner.telling) is None:
+            return None
+        names, device = planner.card.observed, self.problem.device
+        return lambda seen, present: self._guided(planner, telling([seen[name] for name in names], present).to(device))
+
+    def _guided(self, planner: Checkpoint, told: torch.Tensor | None) -> Denoiser:
+        return guided(planner.net, self.settings["weight"], 1.0 if planner.frame is None else RELATIVE_LIMIT, told)
 
     @property
     def calls_a_step(self) -> int:
