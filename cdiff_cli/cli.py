@@ -157,7 +157,8 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     groups = compare([{k: float(v) if isinstance(v, int) and k != "seed" else v for k, v in row.items()} for row in finished.rows])
     if as_json:
         found = json.loads(render(groups, table, "json"))
-        typer.echo(json.dumps({"run": str(finished.path), "summary": found, "certificate": finished.counts}))
+        said = {"run": str(finished.path), "summary": found, "certificate": finished.counts, "notes": list(finished.notes)}
+        typer.echo(json.dumps(said))
     else:
         transposed(groups[0], table)
         for note in finished.notes:

@@ -43,6 +43,7 @@ RANKS = {
     "inverse": 8,
     "checkpoint": 9,
     "margins": 3,
+    "calibrations": 3,
     "episodes": 8,
     "control": 11,
     "control_figures": 12,

@@ -11,9 +11,9 @@ import torch
 import yaml
 from typer.testing import CliRunner
 
+from cdiff_cli.calibrations import read_calibrations
 from cdiff_cli.checkpoint import card_path, load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.cli import app
-from cdiff_cli.margins import read_margins
 from cdiff_cli.recipe import home
 from cdiff_cli.runs import read_rows
 
@@ -149,14 +149,38 @@ def test_calibration_writes_margins_beside_the_checkpoint_and_rollouts_use_them(
     words = (*BALL, "--checkpoint", checkpoint, "--episodes", 3, "--execute", 8)
     stdout = cdiff(*words, "--calibrate", "--level", 0.75, "--runs", tmp_path / "runs").stdout
     assert "margins at level 0.75 from 3 episodes: moving-ball" in stdout
-    found = read_margins(checkpoint)["ball-run"]
-    assert (found.level, found.episodes, found.seed, found.method) == (0.75, 3, 0, "alm")
-    margin = found.constraints["moving-ball"]
+    (found,) = read_calibrations(checkpoint)
+    assert (found.stem, found.level, found.episodes, found.seed) == ("ball-run", 0.75, 3, 0)
+    assert (found.conditions.method, found.conditions.execute, found.conditions.settings["rho"]) == ("alm", 8, 10.0)
+    margin = found.margins["moving-ball"]
     assert margin.margin == max(margin.largest, 0.0)  # the third of three covers three in four
     assert not (tmp_path / "runs").exists()
-    cdiff(*words, "--method", "diffuser", "--runs", tmp_path / "runs")
+    stdout = cdiff(*words, "--runs", tmp_path / "runs").stdout
+    assert "note:" not in stdout
     (run,) = (tmp_path / "runs").iterdir()
-    assert yaml.safe_load((run / "run.yaml").read_text())["margins"] == {"moving-ball": margin.margin}
+    config = yaml.safe_load((run / "run.yaml").read_text())
+    assert config["margins"] == {"moving-ball": margin.margin}
+    assert (config["margins_from"]["match"], config["margins_from"]["calibrated"]["conditions"]["execute"]) == ("exact", 8)
+
+
+def test_a_rollout_says_where_its_margins_were_calibrated_on_something_else(tmp_path):
+    checkpoint = copied(tmp_path)
+    words = (*BALL, "--checkpoint", checkpoint, "--execute", 15)
+    told = "note: no margin was calibrated on"
+    assert told in cdiff(*words, "--episodes", 1, "--runs", tmp_path / "before").stdout
+    cdiff(*words, "--episodes", 1, "--calibrate", "--level", 0.5)
+    said = json.loads(cdiff(*words, "--episodes", 1, "--method", "projected", "--json", "--runs", tmp_path / "runs").stdout)
+    (note,) = said["notes"]
+    assert note.startswith("note: the margins were calibrated with method alm (now projected), settings ")
+    command = f"--task ball-run --method projected --checkpoint {checkpoint} --execute 15"
+    assert f"cdiff rollout --calibrate --level 0.99 --episodes 100 --seed 5000 {command}`" in note
+    (run,) = (tmp_path / "runs").iterdir()
+    told = yaml.safe_load((run / "run.yaml").read_text())["margins_from"]
+    assert (told["match"], told["unlike"]) == ("other", ["method", "settings"])
+
+
+def test_what_ignores_the_constraints_needs_no_margin(tmp_path):
+    assert "note:" not in cdiff(*BALL, "--method", "diffuser", "--episodes", 1, "--execute", 15, "--runs", tmp_path).stdout
 
 
 def test_calibration_as_json_names_its_file(tmp_path):
@@ -164,7 +188,7 @@ def test_calibration_as_json_names_its_file(tmp_path):
     words = ("--method", "diffuser", "--episodes", 1, "--execute", 15, "--calibrate", "--level", 0.5, "--json")
     said = json.loads(cdiff(*BALL, "--checkpoint", checkpoint, *words).stdout)
     assert said["file"] == str(tmp_path / "small.margins.yaml")
-    assert said["constraints"]["moving-ball"]["largest"] >= said["constraints"]["moving-ball"]["margin"] >= 0
+    assert said["margins"]["moving-ball"]["largest"] >= said["margins"]["moving-ball"]["margin"] >= 0
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.95, 19), (0.99, 99), (0.9, 9), (0.75, 3)])
