@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
+from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
 from cdiff_cli.episodes import Episodes, Log
 from cdiff_cli.errors import InfeasibleError
@@ -278,9 +279,8 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         if last is not None:
             steps = controller.calls - controller.extra_steps
             schedule = schedule.until(steps)
-            moved = np.concatenate((last[:, controller.execute :], last[:, -1:].repeat(controller.execute, 1)), 1)
             a = schedule.alpha_bar[-1]
-            first = (a**0.5 * to.encode(torch.from_numpy(moved)).to(like)) + (1 - a) ** 0.5 * next(noise)
+            first = a**0.5 * _moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
         z = sample(
             timed,
             schedule,
@@ -304,6 +304,15 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
             missed = (obeyed(torch.from_numpy(x)) > TOLERANCE).any(1).numpy()
     synchronise(device)
     return _Found(x, scored, missed, time.perf_counter() - began, timed.seconds)
+
+
+def _moved_on(to: Normaliser, last: Array, steps: int) -> Tensor:
+    """The last plans, environment units, moved on by the steps executed, z in the frame of the present state. What they do not reach
+    goes on as the frame foresees, z = 0: a last waypoint stood still, few steps of denoising would take for the plan's end.
+    """
+    z = to.encode(torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)))
+    z[:, -steps:] = 0.0
+    return z
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:
