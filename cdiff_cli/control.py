@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -10,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cdiff_cli.affine_rows import AffineRows
+from cdiff_cli.condensed import condensed
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
@@ -64,6 +67,11 @@ class Controller:
     @property
     def horizon(self) -> int:
         return self.frame.mean.shape[0]
+
+    @cached_property
+    def condensed(self) -> AffineRows | None:
+        """The rows of what is obeyed as one matrix, float64, where they are affine and nothing has to be observed."""
+        return condensed(self.enforced, self.horizon, len(self.task.layout))
 
     @property
     def calls(self) -> int:
@@ -141,32 +149,14 @@ def control(
     return log.episodes()
 
 
-@dataclass(frozen=True)
-class _InUnits:
-    """The method on coordinates y = scale * z, which have the units of the environment: what is near is measured there. The scales
+def _in_units(denoiser: Denoiser, scale: Tensor) -> Denoiser:
+    """The denoiser on coordinates y = scale z, which have the units of the environment: what is near is measured there. The scales
     of z differ a hundredfold along the window, and a method on z would leave the first waypoints, which are all that is
-    executed, as they are. The reverse step is linear, so that it is the same step in y.
+    executed, as they are. The reverse steps are linear and without a constant, so that they are the same in y.
 
     scale   [horizon, dim]
     """
-
-    method: Method
-    scale: Tensor
-
-    def init(self, x: Traj, g: Constraint) -> Any:
-        return self.method.init(x, g)
-
-    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
-        scale = self.scale
-        y = replace(
-            step,
-            x=scale * step.x,
-            x0=scale * step.x0,
-            reverse=lambda clean: scale * step.reverse(clean / scale),
-            pins=Pins(step.pins.mask, scale * step.pins.values),
-        )
-        out, state = self.method.step(y, g, state)
-        return out / scale, state
+    return lambda y, t: scale * denoiser(y / scale, t)
 
 
 @dataclass
@@ -264,40 +254,39 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
     began = time.perf_counter()
     with torch.inference_mode():
         here = torch.from_numpy(states)
-        to = controller.frame.at(here)
-        scored, obeyed = (asked.bind(g, controller) for g in (controller.g, controller.enforced))
-        like = torch.empty(0, device=device)
-        unit = torch.ones_like(to.scale)
+        to, like = controller.frame.at(here), torch.empty(0, device=device)
+        scale, unit = to.scale.to(like), torch.ones_like(here[0])
+        scored = asked.bind(controller.g, controller)
+        obeyed = scored if controller.enforced is controller.g else asked.bind(controller.enforced, controller)
         g = pull_back(obeyed, to.centre, unit).to(like)
-        shape = (horizon, states.shape[1])
-        mask = torch.zeros(shape, dtype=torch.bool, device=device)
+        if controller.condensed is not None:
+            g = replace(g, condensed=controller.condensed.about(to.centre, like))
+        mask = torch.zeros((horizon, states.shape[1]), dtype=torch.bool, device=device)
         mask[0] = True
-        begin = to.encode(here[:, None].expand(-1, horizon, -1))
-        pins = Pins(mask, begin.to(like))
+        begin = here[:, None] - to.centre
         schedule, first = controller.schedule, None
-        noise = iter(draws.to(device).unbind(1))
+        noise = iter((scale * draws.to(device)).unbind(1))
         if last is not None:
-            steps = controller.calls - controller.extra_steps
-            schedule = schedule.until(steps)
+            schedule = schedule.until(controller.calls - controller.extra_steps)
             a = schedule.alpha_bar[-1]
             first = a**0.5 * _moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
-        z = sample(
-            timed,
+        y = sample(
+            _in_units(timed, scale),
             schedule,
-            _InUnits(method, to.scale.to(like)),
+            method,
             g,
-            pins,
+            Pins(mask, begin.to(like)),
             lambda: next(noise),
             kernel=KERNELS[controller.kernel],
             extra_steps=controller.extra_steps,
             first=first,
         )
-        z64 = z.double().cpu()
-        if controller.polish:
+        y64 = y.double().cpu()
+        inside = obeyed if controller.condensed is None else replace(obeyed, condensed=controller.condensed)
+        if controller.polish and bool((inside(to.centre + y64) > -MARGIN).any()):
             g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
-            y, _ = project_from(g64, to.scale * z64, Pins(mask.cpu(), to.scale * begin), None, 0)
-            z64 = y / to.scale
-        x = to.decode(z64).numpy()
+            y64, _ = project_from(g64, y64, Pins(mask.cpu(), begin), None, 0)
+        x = (to.centre + y64).numpy()
         x[:, 0] = states
         missed = np.zeros(len(x), dtype=bool)
         if controller.polish and controller.brake is not None:
@@ -307,12 +296,12 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
 
 
 def _moved_on(to: Normaliser, last: Array, steps: int) -> Tensor:
-    """The last plans, environment units, moved on by the steps executed, z in the frame of the present state. What they do not reach
-    goes on as the frame foresees, z = 0: a last waypoint stood still, few steps of denoising would take for the plan's end.
+    """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
+    reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
     """
-    z = to.encode(torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)))
-    z[:, -steps:] = 0.0
-    return z
+    y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - to.centre
+    y[:, -steps:] = 0.0
+    return y
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:
