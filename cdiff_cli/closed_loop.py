@@ -99,8 +99,6 @@ def controller(resolved: Resolved) -> Controller:
     problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
     if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
         raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
-    if isinstance(resolved.method, BestOf):
-        raise CdiffError(f"{options.method}: only for whole plans, and {problem.task.name} plans anew at each step; choose another")
     execute, warm = resolved.conditions.execute, resolved.conditions.warm
     inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
     ahead = 1 if inverse is None else inverse.ahead
@@ -122,11 +120,12 @@ def controller(resolved: Resolved) -> Controller:
         device=problem.device,
         kernel=resolved.kernel,
         extra_steps=resolved.conditions.extra_steps,
-        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
+        polish=preset.polish and not isinstance(resolved.method, Unconstrained | BestOf),
         temperature=preset.temperature,
         ahead=ahead,
         execute=execute,
         warm=warm,
+        resume=preset.resume,
         brake=getattr(problem.task, "brake", None),
         action_noise=options.action_noise,
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cdiff_cli.affine_rows import AffineRows
+from cdiff_cli.baselines import BestOf
 from cdiff_cli.condensed import condensed
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
 from cdiff_cli.data import Normaliser
@@ -19,9 +20,9 @@ from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sampl
 from cdiff_cli.episodes import Episodes, Log
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
-from cdiff_cli.methods import AlmState
+from cdiff_cli.methods import AlmState, Unconstrained
 from cdiff_cli.networks import InverseDynamics
-from cdiff_cli.planning import MARGIN, Timed, synchronise
+from cdiff_cli.planning import MARGIN, Timed, candidate_seed, synchronise
 from cdiff_cli.projection import project_from
 from cdiff_cli.tasks import ControlTask
 
@@ -40,6 +41,7 @@ class Controller:
     execute       environment steps a plan is followed
     warm          share of the diffusion steps done again on the last plan, moved on by what was executed, from the multipliers
                   it ended with, moved on likewise; None: all, from noise
+    resume        begin each plan from the multipliers that the last one ended with, as they are
     brake         state -> input that is used where the last projection leaves a plan outside of what it was to obey; None: the
                   plan's own
     action_noise  standard deviation of what is added to each input, over half its range: a disturbance, not ours to know
@@ -61,6 +63,7 @@ class Controller:
     ahead: int = 1
     execute: int = 1
     warm: float | None = None
+    resume: bool = False
     brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
 
@@ -74,10 +77,19 @@ class Controller:
         return condensed(self.enforced, self.horizon, len(self.task.layout))
 
     @property
+    def redone(self) -> int:
+        """Diffusion steps a plan, the first of an episode apart where plans are warm."""
+        return self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
+
+    @property
+    def tries(self) -> int:
+        """Plans made of which one is kept."""
+        return self.method.k if isinstance(self.method, BestOf) else 1
+
+    @property
     def calls(self) -> int:
-        """Network calls a plan, the first of an episode apart where plans are warm."""
-        steps = self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
-        return steps + self.extra_steps
+        """Network calls a control step at which plans are made."""
+        return self.tries * (self.redone + self.extra_steps)
 
 
 def control(
@@ -96,7 +108,7 @@ def control(
     task = controller.task
     total = task.max_steps if steps is None else steps
     envs = [task.make_env(**(env_options or {})) for _ in seeds]
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    generators = [[torch.Generator().manual_seed(candidate_seed(seed, j)) for j in range(controller.tries)] for seed in seeds]
     disturbances = [np.random.default_rng((seed, 1)) for seed in seeds]
     low, high = envs[0].action_space.low, envs[0].action_space.high
     log = Log(task, len(controller.g.parts), len(seeds), total)
@@ -104,13 +116,15 @@ def control(
         states = np.stack([task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)])
         log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
         alive, plans, since = np.arange(len(seeds)), np.empty((len(seeds), controller.horizon, states.shape[1])), 0
-        method, stuck = _Resumed(controller.method, controller.execute), np.zeros(len(seeds), dtype=bool)
+        shift = 0 if controller.warm is None else controller.execute
+        method, stuck, before = _Resumed(controller.method, shift), np.zeros(len(seeds), dtype=bool), alive
         while log.done < total and len(alive):
             tau = log.done
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
-                method = _Resumed(controller.method, controller.execute, method.state if last is not None else None)
-                draws = _draws(controller, [generators[i] for i in alive])
+                goes_on = last is not None or controller.resume
+                method = _Resumed(controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None)
+                before, draws = alive, _draws(controller, [each for i in alive for each in generators[i]])
                 found = _plan(controller, method, _Asked(states[alive], log.now(alive), last, draws))
                 plans[alive] = found.x
                 log.plan(tau, alive, found.x, found.g, found.total_s, found.network_s)
@@ -164,7 +178,7 @@ class _Resumed:
     """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
     to be found again in the few steps of a warm plan.
 
-    state   of the method after its last step
+    state   of the method after its last step; None to begin anew
     """
 
     method: Method
@@ -181,8 +195,15 @@ class _Resumed:
         x, self.state = self.method.step(step, g, state)
         return x, self.state
 
+    def of(self, which: NDArray[np.bool_]) -> Any:
+        """The state of some of the episodes alone; multipliers that all share are theirs too."""
+        state, some = self.state, torch.from_numpy(which)
+        if isinstance(state, AlmState):
+            return state._replace(lam=state.lam[some] if len(state.lam) == len(some) else state.lam)
+        return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
+
     def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on part by part, the new ones at the end as they begin; all as they begin where an episode ended."""
+        """The last rows moved on part by part, the new ones at the end as they begin."""
         if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
             return fresh
         out, at = fresh.clone(), 0
@@ -208,7 +229,7 @@ class _Found:
 
 class _Asked(NamedTuple):
     """What plans of one control step begin from: states [n, dim], observed quantities [n], the last plans [n, horizon, dim] where
-    they are carried on, noise [n, count, horizon, dim].
+    they are carried on, noise [n tries, count, horizon, dim].
     """
 
     states: Array
@@ -216,11 +237,10 @@ class _Asked(NamedTuple):
     last: Array | None
     draws: Tensor
 
-    def one(self, i: int) -> "_Asked":
-        """The same of one episode."""
-        which = slice(i, i + 1)
+    def of(self, which: Any, draws: Tensor) -> "_Asked":
+        """The same of some of the episodes, or of each several times, with that noise."""
         seen = {name: values[which] for name, values in self.observed.items()}
-        return _Asked(self.states[which], seen, None if self.last is None else self.last[which], self.draws[which])
+        return _Asked(self.states[which], seen, None if self.last is None else self.last[which], draws)
 
     def bind(self, g: Constraint, controller: Controller) -> Constraint:
         """g as it is now."""
@@ -232,6 +252,8 @@ def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
     """Plans for all. Where one of several cannot be, the others are made without it; one that cannot be is to stay where it is, and
     missed.
     """
+    if isinstance(controller.method, BestOf):
+        return _best_of(controller, asked)
     began = time.perf_counter()
     try:
         return _plan_together(controller, method, asked)
@@ -242,9 +264,20 @@ def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
     if n == 1:
         stay = asked.states[:, None].repeat(controller.horizon, 1)
         return _Found(stay, scored, np.ones(1, dtype=bool), time.perf_counter() - began, 0.0)
-    each = [_plan(controller, controller.method, asked.one(i)) for i in range(n)]
+    each = [_plan(controller, controller.method, asked.of([i], asked.draws[i : i + 1])) for i in range(n)]
     x, missed = np.concatenate([found.x for found in each]), np.concatenate([found.missed for found in each])
     return _Found(x, scored, missed, time.perf_counter() - began, sum(found.network_s for found in each))
+
+
+def _best_of(controller: Controller, asked: _Asked) -> _Found:
+    """Of `tries` unconstrained plans an episode the one with the least sum of [g]_+, g as enforced; the first among equals."""
+    n, k = len(asked.states), controller.tries
+    many = asked.of(np.repeat(np.arange(n), k), asked.draws)
+    found = _plan_together(replace(controller, polish=False), Unconstrained(), many)
+    unsafe = many.bind(controller.enforced, controller)(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
+    best = np.nan_to_num(unsafe, nan=np.inf).reshape(n, k).argmin(1) + k * np.arange(n)
+    scored = asked.bind(controller.g, controller)
+    return _Found(found.x[best], scored, found.missed[best], found.total_s, found.network_s)
 
 
 def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Found:
@@ -267,7 +300,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         schedule, first = controller.schedule, None
         noise = iter((scale * draws.to(device)).unbind(1))
         if last is not None:
-            schedule = schedule.until(controller.calls - controller.extra_steps)
+            schedule = schedule.until(controller.redone)
             a = schedule.alpha_bar[-1]
             first = a**0.5 * _moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
         y = sample(
@@ -305,6 +338,6 @@ def _moved_on(to: Normaliser, last: Array, steps: int) -> Tensor:
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:
-    """Noise for a whole plan, one generator an episode [n, steps + 1, horizon, dim]."""
+    """Noise for a whole plan, one generator a plan [n, steps + 1, horizon, dim]."""
     shape = (controller.schedule.n_steps + 1, controller.horizon, len(controller.task.layout))
     return controller.temperature * torch.stack([torch.randn(shape, generator=generator) for generator in generators])
