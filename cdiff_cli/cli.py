@@ -358,17 +358,17 @@ def sweep(
     runs: RunsFolder = RUNS,
 ) -> None:
     """Make the missing runs of a matrix (task, constraints, preset, method, seed); start it again and it goes on. Exit code 1 where
-    a run failed. `cdiff compare` then prints the table.
+    a run failed or diverged. `cdiff compare` then prints the table.
     """
     from cdiff_cli.sweep import Matrix, run_sweep
 
     tasks, named, asked = ([name.strip() for name in text.split(",") if name.strip()] for text in (task, methods, presets))
     matrix = Matrix(tasks, named, asked, constraints or [None], range(seed, seed + seeds), rollout, random)
-    failed = run_sweep(matrix, runs, jobs, err, backend, address)
-    for outcome in failed:
-        typer.echo(f"failed: {outcome.job.name}: {outcome.error}", err=True)
+    troubled = run_sweep(matrix, runs, jobs, err, backend, address)
+    for outcome in troubled:
+        typer.echo(outcome.trouble, err=True)
     typer.echo(f"compare them with: cdiff compare {runs}")
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if troubled else 0)
 
 
 @app.command()

@@ -1,7 +1,7 @@
 """Affine rows as one matrix: what they are read off is what they give back."""
 
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdiff_cli.condensed import condensed
@@ -12,6 +12,7 @@ from tests.problems import F64, ball, chain, vec, waypoints
 H = 6
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.05, 1.0), st.booleans())
 def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, alpha, high_order):
     """float64: a hundred additions of numbers of size one stay within 1e-12."""

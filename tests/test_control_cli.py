@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,10 +12,11 @@ import torch
 import yaml
 from typer.testing import CliRunner
 
+from cdiff_cli import closed_loop
 from cdiff_cli.calibrations import read_calibrations
 from cdiff_cli.checkpoint import card_path, load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.cli import app
-from cdiff_cli.recipe import home
+from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.runs import read_rows
 
 ROOT = Path(__file__).parent.parent
@@ -141,6 +143,21 @@ def test_options_of_the_environment_are_part_of_what_was_asked(tmp_path):
         assert np.isfinite(done["violation"]).sum() == 13  # 100 steps, a plan each 8
 
 
+@pytest.mark.parametrize("task", ["ball-run", "hopper", "swimmer"])
+@pytest.mark.parametrize("method", ["guidance", "terminal", "final-projection", "best-of-k"])
+def test_the_baselines_act_too(task, method, tmp_path, monkeypatch):
+    """Four steps: that each acts, and makes the network calls it says."""
+    monkeypatch.setattr(closed_loop, "control", partial(closed_loop.control, steps=4))
+    words = ("--method", method, "--episodes", 1, *(("--set", "k=3") if method == "best-of-k" else ()))
+    cdiff("rollout", "--task", task, *words, "--runs", tmp_path)
+    (run,) = tmp_path.iterdir()
+    (row,) = read_rows(run / "rows.csv")
+    assert row["steps"] == 4
+    assert row["calls"] == load_recipe(task).n_steps * (3 if method == "best-of-k" else 1)
+    if method in ("terminal", "final-projection"):
+        assert row["safe_plans"] == 1
+
+
 # margins --------------------------------------------------------------------------------------------------------------
 
 
@@ -237,7 +254,6 @@ REFUSED = {
     "warm in a maze": (MAZE, ["--warm", 0.3], ["--warm is for control tasks"]),
     "margin in a maze": (MAZE, ["--margin", 0.1], ["--margin is for control tasks"]),
     "noise in a maze": (MAZE, ["--action-noise", 0.1], ["--action-noise is for control tasks"]),
-    "best of k": (BALL, ["--method", "best-of-k"], ["best-of-k: only for whole plans, and ball-run plans anew"]),
     "constraints of another task": (BALL, ["--constraints", ROOT / "constraints/hopper.yaml"], [":3 task", "change one of them"]),
     "checkpoint of another task": (
         BALL,
