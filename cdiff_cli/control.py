@@ -273,7 +273,7 @@ def _best_of(controller: Controller, asked: _Asked) -> _Found:
     """Of `tries` unconstrained plans an episode the one with the least sum of [g]_+, g as enforced; the first among equals."""
     n, k = len(asked.states), controller.tries
     many = asked.of(np.repeat(np.arange(n), k), asked.draws)
-    found = _plan_together(replace(controller, polish=False), Unconstrained(), many)
+    found = _plan_together(controller, Unconstrained(), many)
     unsafe = many.bind(controller.enforced, controller)(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
     best = np.nan_to_num(unsafe, nan=np.inf).reshape(n, k).argmin(1) + k * np.arange(n)
     scored = asked.bind(controller.g, controller)

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
     """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
+    if not margins:
+        return g
     return Constraint(tuple(part.shift_level(margins.get(part.name, 0.0)) if part.name in margins else part for part in g.parts))
 
 

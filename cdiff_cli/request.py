@@ -307,7 +307,9 @@ def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, ch
     if preset.dynamics and dynamics is not None and not dynamics_of(g):
         parts = (*parts, Reachable.of("dynamics", dynamics, DYNAMICS_TOLERANCE))
     weight = torch.tensor([VELOCITY_WEIGHT if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
-    return Constraint(tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts))
+    parts = tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts)
+    unchanged = len(parts) == len(g.parts) and all(part is declared for part, declared in zip(parts, g.parts, strict=True))
+    return g if unchanged else Constraint(parts)
 
 
 def needed_speed(resolved: Resolved) -> tuple[float, float] | None:

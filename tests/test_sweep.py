@@ -110,9 +110,12 @@ def test_what_cannot_begin_is_told_and_does_not_stop_the_others(tmp_path):
 
 def test_a_job_runs_on_one_thread_and_leaves_the_number_as_it_was(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(
-        "cdiff_cli.experiment.plan_run", lambda *_, **__: seen.append(torch.get_num_threads()) or SimpleNamespace(rows=())
-    )
+
+    def plan_run(*_, **__):
+        seen.append(torch.get_num_threads())
+        return SimpleNamespace(rows=())
+
+    monkeypatch.setattr("cdiff_cli.experiment.plan_run", plan_run)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     (job,) = plan_sweep(matrix(seeds=[0]), tmp_path).todo
