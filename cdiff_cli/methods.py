@@ -244,7 +244,12 @@ def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
 
 def idle(g: Constraint, step: Step, lam: Rows) -> bool:
     """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
-    return not dynamics_of(g) and not bool(lam.any()) and not bool((g(step.x0) > 0).any())
+    return not dynamics_of(g) and not _positive(lam) and not _positive(g(step.x0))
+
+
+def _positive(rows: Rows) -> bool:
+    """Whether one of them is, or is no number."""
+    return rows.numel() > 0 and not float(rows.amax()) <= 0
 
 
 def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:

@@ -121,6 +121,8 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     sliding = any(isinstance(part, Segments) for part in g.parts)
     around = cast(Any, [part for part in g.parts if sliding and tangible(part)])
     others = [part for part in g.parts if not (sliding and tangible(part))]
+    if not around and len(others) > 1 and pins.whole and (x := _onto_one(g, z, pins, tolerance)) is not None:
+        return x
     begin = z
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
@@ -135,6 +137,19 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             return x
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
+
+
+def _onto_one(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> Traj | None:
+    """z where it obeys all parts, or its projection onto the only part that it does not obey, where that obeys the others too: the
+    nearest point of a larger set that lies in the smaller one is the nearest of that. None where more have to be heard.
+    """
+    if not bool((g(z) > 0).any()):
+        return z
+    broken = [part for part in g.parts if bool((part(z) > 0).any())]
+    if len(broken) > 1 or not has_exact_form(broken[0]):
+        return None
+    x = exact(broken[0], z, pins)
+    return x if bool((_free_rows(g, x, pins) <= tolerance).all()) else None
 
 
 def tangible(part: Part) -> bool:

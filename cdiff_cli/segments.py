@@ -51,6 +51,8 @@ def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint:
     """g with each part that goes round a ball replaced by two: the half-spaces of its tangent planes at x, of the segment before
     each waypoint and of the segment after. One row a waypoint, in the part's own units; -1 where there is no such segment.
     """
+    if not any(goes_round(part) for part in g.parts):
+        return g
     parts: list[Part] = []
     for part in g.parts:
         if not goes_round(part):
