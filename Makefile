@@ -28,9 +28,9 @@ benchmark: .venv/.ready  ## timings, as ratios within one run
 oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
 	$(BIN)/python tests/benchmarks/oracle.py
 
-experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 12 minutes
+experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 20 minutes
 	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1
-	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0
+	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 5
 
 .venv/.ready: requirements.txt pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv
