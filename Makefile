@@ -29,9 +29,9 @@ benchmark: .venv/.ready  ## timings, as ratios within one run
 oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
 	$(BIN)/python tests/benchmarks/oracle.py
 
-experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 12 minutes
+experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 20 minutes
 	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1
-	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0
+	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 5
 
 margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour
 	for c in hopper hopper-hard swimmer swimmer-hard; do for m in alm projected primal-dual safediffuser; do \
