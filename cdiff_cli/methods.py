@@ -27,7 +27,7 @@ from cdiff_cli.dynamics import DYNAMICS_FROM, Warm, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
 from cdiff_cli.safediffuser import SafeDiffuser
-from cdiff_cli.segments import turned
+from cdiff_cli.segments import Turned, apart, crossed, turned
 
 On = Literal["noisy", "clean"]
 DualOn = Literal["noisy", "estimate", "clean"]
@@ -116,11 +116,11 @@ class PrimalDual:
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
         g, dynamics = split(due(g, step.level, self.dynamics_from))
-        g = turned(g, step.x0, step.pins)
-        rows, pull, size = linearise(g, step.x0, self.positive)
+        flat = turned(g, step.x0, step.pins)
+        rows, pull, size = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
-        rows, _, size = linearise(g, x0, self.positive)
+        rows, _, size = linearise(flat, x0, self.positive)
         dual = expect(rows / size.clamp_min(1e-12), self.expectation)
         return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)
 
@@ -181,11 +181,11 @@ class AugmentedLagrangian:
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
             return step.reverse(x0), AlmState(lam, rho, warm)
-        g = turned(g, step.x0, step.pins)
-        rows, pull, _ = linearise(g, step.x0, self.positive)
+        flat = turned(g, step.x0, step.pins)
+        rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         for _ in range(self.inner):
-            rows, pull, size = linearise(g, x0, self.positive)
+            rows, pull, size = linearise(flat, x0, self.positive)
             lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
             x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         return step.reverse(x0), AlmState(lam, self._grown(rho))
@@ -244,10 +244,13 @@ def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
 
 def idle(g: Constraint, step: Step, lam: Rows) -> bool:
     """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
-    return not dynamics_of(g) and not bool(lam.any()) and not bool((g(step.x0) > 0).any())
+    if dynamics_of(g) or bool(lam.any()):
+        return False
+    round_, others = apart(g)
+    return not bool(crossed(round_, step.x0).any()) and not bool((others(step.x0) > 0).any())
 
 
-def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
+def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
     """g(x), its pull w -> w^T dg/dx and row sizes |dg/dx|^2, of g itself or of its smooth positive part g / (1 + e^-g)."""
     rows, pull, size = g.linearise(x)
     if positive == "none":

@@ -27,7 +27,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import Reachable, Warm, dynamics_of, nearest_reachable, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.segments import goes_round, nearest_in_planes, planes
+from cdiff_cli.segments import crossed, goes_round, nearest_around
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
@@ -130,8 +130,9 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             return x  # one exact form misses only what is pinned behind what it moves
         if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
             x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
-        missed = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
-        if not missed or (around and not strict):
+        if around and not strict:
+            return x
+        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
@@ -143,19 +144,14 @@ def tangible(part: Part) -> bool:
 
 
 def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
-    """Projection onto the half-spaces of tangent planes, chosen anew at each result: the set so described holds the last result,
-    so the distance to z can only fall.
-    """
-    touched = (Constraint(tuple(parts))(z) > 0).any(1)
-    if not bool(touched.any()):
+    """Projection onto the half-spaces of tangent planes, chosen anew at each result; plans that obey already are left alone."""
+    touched = crossed(parts, z).nonzero()[:, 0]
+    if not len(touched):
         return z
-    some, held = z[touched], Pins(pins.mask, pins.values[touched])
-    parts, x = [part.take(touched) for part in parts], some
-    for _ in range(REFINEMENTS):
-        x = nearest_in_planes(some, planes(parts, x, held), held)
-    out = z.clone()
-    out[touched] = x
-    return out
+    every = len(touched) == len(z)
+    if every:
+        return nearest_around(parts, z, pins, REFINEMENTS)
+    return z.index_copy(0, touched, nearest_around([part.take(touched) for part in parts], z[touched], pins, REFINEMENTS))
 
 
 def has_exact_form(part: Part) -> bool:
