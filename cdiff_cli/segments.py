@@ -13,16 +13,15 @@ from typing import TypeGuard
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from cdiff_cli.constraint import Constraint, Part, Pins, Pull, Rows, Segments, Traj, Waypoints
 from cdiff_cli.levels import Affine, Ellipsoid, each_end, times
+from cdiff_cli.tangents import ROUNDING, ahead, nearest_points, normals_of, outwards
 
 Planes = tuple[Tensor, Tensor]
 """Half-spaces a.x <= b of each waypoint: a [batch, horizon, m, dim], b [batch, horizon, m]."""
 
 NEVER = 1e30  # bound of a half-space that is not there
-_ROUNDING = {torch.float64: 1e-9, torch.float32: 1e-4}  # of the distance of a segment, well above that of a safe path
 
 
 def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes:
@@ -60,8 +59,8 @@ def crossed(parts: Sequence[Waypoints | Segments], x: Traj) -> Tensor:
             found |= (level(x) > 0).any(1)
         else:
             assert isinstance(level, Ellipsoid)
-            y = _ahead(level.scaled(x))
-            found |= (_nearest(y[:, :-1], y[:, 1:])[1] < 1).any(1)
+            y = ahead(level.scaled(x))
+            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1).any(1)
     return found
 
 
@@ -131,12 +130,8 @@ def _tangent(n: Tensor, which: Tensor, centre: Tensor, axes: Tensor) -> tuple[Te
 
 
 def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
-    """Outward unit normals n of the tangent planes, one a segment, in the coordinates where the surface is the unit sphere
-    [batch, horizon - 1, k]: both ends y of the segment are to satisfy n.y >= 1.
-
-    Outside, n points to the segment's nearest point. Along a run of segments inside, from waypoint a to waypoint b, n turns
-    from the direction of a by way of that of the run's nearest point to that of b, in proportion to the path walked.
-    On a line there is no way round: all normals point to the side that is nearer as a whole.
+    """Normals of the tangent planes, one a segment, in the coordinates where the surface is the unit sphere (tangents.py)
+    [batch, horizon - 1, k].
     """
     return _each_normals([level], x, pins)[0]
 
@@ -147,34 +142,8 @@ def _each_normals(levels: Sequence[Ellipsoid], x: Traj, pins: Pins) -> Sequence[
     held = [pins.held if pins.whole else pins.mask[:, level.which.argmax(-1)].all(1) for level in levels]
     alike = len({y.shape[-1] for y in scaled}) == 1 and all(h is held[0] or torch.equal(h, held[0]) for h in held[1:])
     if not alike or len(levels) == 1:
-        return [_normals(_ahead(y), pinned) for y, pinned in zip(scaled, held, strict=True)]
-    return _normals(_ahead(torch.cat(scaled)), held[0]).chunk(len(levels))
-
-
-def _ahead(y: Tensor) -> Tensor:
-    """The same numbers with the last dimension first in memory: torch sums over a short last dimension slowly."""
-    return y.movedim(-1, 0).contiguous().movedim(0, -1)
-
-
-def _nearest(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of each segment [..., k] the point nearest to 0, its distance from there, and the square of the segment's length."""
-    d = last - first
-    square = d.square().sum(-1)
-    share = ((first * d).sum(-1) / square.clamp_min(1e-30)).neg_().clamp_(0.0, 1.0)
-    near = torch.addcmul(first, share[..., None], d)
-    return near, near.square().sum(-1).sqrt_(), square
-
-
-def _normals(y: Tensor, pinned: Tensor) -> Tensor:
-    """normals() of y [batch, horizon, k], pinned [horizon]."""
-    if y.shape[-1] == 1:
-        return _one_side(y, pinned)
-    near, distance, square = _nearest(y[:, :-1], y[:, 1:])
-    n = near / distance.clamp_min(1e-9)[..., None]
-    inside = distance < 1 - _ROUNDING[y.dtype]
-    if bool(inside.any()):
-        n[inside] = _turning(y, near, distance, square.sqrt(), inside)
-    return _tangent_to_pins(n, y, pinned)
+        return [normals_of(ahead(y), pinned) for y, pinned in zip(scaled, held, strict=True)]
+    return normals_of(ahead(torch.cat(scaled)), held[0]).chunk(len(levels))
 
 
 def nearest_in_planes(z: Traj, halfspaces: Planes, pins: Pins) -> Traj:
@@ -250,13 +219,13 @@ def _planes_beside(
             slots.append((own(level.a, 1).expand(n, dim).T[:, None], own(level.b, 0).expand(1, n)))
             continue
         assert isinstance(level, Ellipsoid)
-        y = _ahead(level.scaled(x).flatten(0, 1).index_select(0, beside.flatten()).view(3, n, -1))
-        near, distance, _ = _nearest(y[:2], y[1:])
-        if y.shape[-1] == 1 or bool((distance < 1 - _ROUNDING[x.dtype]).any()):
+        y = ahead(level.scaled(x).flatten(0, 1).index_select(0, beside.flatten()).view(3, n, -1))
+        near, distance, _ = nearest_points(y[:2], y[1:])
+        if y.shape[-1] == 1 or bool((distance < 1 - ROUNDING[x.dtype]).any()):
             return None
         normal = near / distance[..., None]
         if held is not None:
-            normal = _outwards(normal, y[::2], held[..., level.which.argmax(-1)].all(-1, keepdim=True))
+            normal = outwards(normal, y[::2], held[..., level.which.argmax(-1)].all(-1, keepdim=True))
         a, b = _tangent(normal, level.which, own(level.centre, 1), own(level.axes, 1))
         slots.append((a.movedim(-1, 0), b if missing is None else torch.where(missing, NEVER, b)))
     return torch.cat([a for a, _ in slots], 1), torch.cat([b for _, b in slots])
@@ -297,99 +266,3 @@ def _step(a: Tensor, value: Tensor) -> Tensor:
     missed = ((d[:, :, None] * a[:, None]).sum(0) + value).amax(1)  # [pairs, n]
     cost = torch.where(missed <= 1e-9, d.square().sum(0), 1e12 * (1 + missed))
     return d.gather(1, cost.argmin(0).expand(len(d), 1, -1))[:, 0]
-
-
-def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
-    """The normal of the whole path on a line: towards its pinned ends, else where it takes the shorter way [batch, n, 1]."""
-    below, above = ((1 + side * y).clamp_min(0).square().sum(1, keepdim=True) for side in (1, -1))
-    held = y[:, pinned].sum(1, keepdim=True)
-    up = torch.where(held == 0, above <= below, held > 0)
-    return (2 * up.to(y) - 1).expand(-1, y.shape[1] - 1, -1)
-
-
-def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: Tensor) -> Tensor:
-    """Normals of the segments inside the sphere, along their runs, as normals() describes [segments inside, k]."""
-    edges = pad(inside, (1, 1))
-    ends = (edges[:, 1:] != edges[:, :-1]).flatten().nonzero().view(-1, 2)  # waypoints where each run begins and stops
-    plan, tau = ends // y.shape[1], ends % y.shape[1]
-    at = y[plan, tau]  # [runs, 2, k]
-    into, out = at[:, 0], at[:, 1]
-    count, step = (ends[:, 1:] - ends[:, :1]), torch.arange(int((ends[:, 1] - ends[:, 0]).max()), device=y.device)
-    own = step < count  # the runs side by side, each padded to the longest [runs, longest]
-    plan, segment = plan[:, :1], (tau[:, :1] + step).clamp_max(inside.shape[1] - 1)
-    deepest = torch.where(own, distance[plan, segment], torch.inf).argmin(1, keepdim=True)
-    nearest = near[plan, segment.gather(1, deepest)][:, 0]
-
-    across = out - into
-    along, e_in, e_out = _unit(torch.stack((across, into, out)), torch.stack((into, across, across)))
-    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
-    e_mid = _unit(nearest, _sideways(aside, across))
-    walked = torch.where(own, length[plan, segment], 0.0)
-    until = walked.cumsum(1)
-    whole = until[:, -1:]
-    share = torch.where(whole > 0, (until - walked / 2) / whole.clamp_min(1e-12), 0.5)  # at the middle of each segment
-    begin, towards = torch.stack((e_in, e_mid)), torch.stack((e_mid, e_out))
-    turn, side = _angle(begin, towards), _perpendicular(begin, towards)
-    angle = share * (turn[0] + turn[1])
-    second = angle > turn[0]
-    angle = torch.where(second, angle - turn[0], angle)[own][:, None]
-    half, run = second[own].long(), own.nonzero()[:, 0]
-    return angle.cos() * begin[half, run] + angle.sin() * side[half, run]
-
-
-def _perpendicular(e: Tensor, towards: Tensor) -> Tensor:
-    """The unit vector at right angles to e on the great circle towards another."""
-    aside = towards - (towards * e).sum(-1, keepdim=True) * e
-    return _unit(_sideways(aside, e), e)
-
-
-def _angle(a: Tensor, b: Tensor) -> Tensor:
-    return 2 * torch.atan2((a - b).norm(dim=-1, keepdim=True), (a + b).norm(dim=-1, keepdim=True))
-
-
-def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
-    """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
-    at = pinned.nonzero()[:, 0]
-    for segment, end in ((at[at < n.shape[1]], 0), (at[at > 0] - 1, 1)):
-        normal = n[:, segment]  # a few of many
-        outwards = _outwards(normal, y[:, segment + end])
-        if outwards is not normal:
-            n = n.index_copy(1, segment, outwards)
-    return n
-
-
-def _outwards(n: Tensor, at: Tensor, held: Tensor | None = None) -> Tensor:
-    """Normals [..., k] turned so far that the points at, which lie outside, are on their outer side; held [..., 1], else all."""
-    length = at.norm(dim=-1, keepdim=True)
-    beyond = ((n * at).sum(-1, keepdim=True) < 1) & (length >= 1)
-    if held is not None:
-        beyond &= held
-    if not bool(beyond.any()):
-        return n
-    e, cosine = at / length.clamp_min(1e-12), 1 / length.clamp_min(1.0)
-    return torch.where(beyond, cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * _perpendicular(e, n), n)
-
-
-def _unit(v: Tensor, instead: Tensor) -> Tensor:
-    """v / |v|, or the direction of another vector where v is nearly zero."""
-    length = v.norm(dim=-1, keepdim=True)
-    if bool((length > 1e-9).all()):
-        return v / length
-    other = instead.norm(dim=-1, keepdim=True)
-    first = torch.zeros_like(v)
-    first[..., 0] = 1.0
-    spare = torch.where(other > 1e-9, instead / other.clamp_min(1e-9), first)
-    return torch.where(length > 1e-9, v / length.clamp_min(1e-9), spare)
-
-
-def _sideways(v: Tensor, along: Tensor) -> Tensor:
-    """v, or where it is nearly zero some vector at right angles to `along`."""
-    enough = v.norm(dim=-1, keepdim=True) > 1e-9
-    if bool(enough.all()):
-        return v
-    turned = torch.zeros_like(along)
-    turned[..., 0], turned[..., 1] = -along[..., 1], along[..., 0]
-    flat = turned.norm(dim=-1, keepdim=True) < 1e-9  # along has neither: any first axis will do
-    first = torch.zeros_like(along)
-    first[..., 0] = 1.0
-    return torch.where(enough, v, torch.where(flat, first, turned))
