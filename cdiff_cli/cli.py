@@ -110,7 +110,7 @@ def train(
         from cdiff_cli.conditioning import Condition, content_sha256
         from cdiff_cli.spec import load_constraints
 
-        kinds, g = load_constraints(conditional, problem.name, problem.layout)
+        kinds, g = load_constraints(conditional, problem.name, problem.layout, dt=problem.dt)
         condition = Condition(conditional.stem, g, content_sha256(kinds))
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe

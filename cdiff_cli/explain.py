@@ -32,7 +32,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     shipped = home() / "models" / name / "small.safetensors"
     checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(file, name, task.layout, fitted, observable, getattr(task, "dt", 1.0))
+    kinds, g = load_constraints(file, name, task.layout, fitted, observable, getattr(task, "dt", None))
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")

@@ -189,7 +189,7 @@ def resolve(options: Options) -> Resolved:
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable, getattr(task, "dt", 1.0))
+    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable, getattr(task, "dt", None))
     limited = [part.name for part in g.parts if isinstance(part, Rate)]
     if limited and recipe.frame == "relative":
         raise CdiffError(f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out')

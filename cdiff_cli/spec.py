@@ -288,13 +288,13 @@ def load_constraints(
     layout: Layout,
     dynamics: LinearDynamics | None = None,
     observable: Sequence[str] = (),
-    dt: float = 1.0,
+    dt: float | None = None,
 ) -> tuple[list[Kind], Constraint]:
     """The kinds of a constraint file and the g(x) <= 0 they compile into, environment units; raises SpecError.
 
     dynamics     what `fit: demonstrations` stands for; None where there are none
     observable   names of the quantities that the task lets constraints observe
-    dt           seconds between its waypoints
+    dt           seconds between its waypoints; None where they have none
     """
     document = Document(path)
     model = cast(Any, document.read(file_model()))
@@ -325,6 +325,10 @@ def load_constraints(
                 )
             named = Dynamics.of(dynamics, layout, named.name, named.tolerance)
         if isinstance(named, RateLimit):
+            if dt is None:
+                raise document.error(
+                    ("constraints", i, "kind"), f"the waypoints of {task} are not in time; a rate has no meaning there"
+                )
             if named.dt not in (None, dt):
                 raise document.error(("constraints", i, "dt"), f"the waypoints of {task} are {dt:g} s apart; leave `dt` out")
             named = named.model_copy(update={"dt": dt})
