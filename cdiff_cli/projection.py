@@ -34,6 +34,7 @@ from cdiff_cli.segments import crossed, goes_round, nearest_around
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+FINER = 30  # what ADMM asks of a projection within it, over its own tolerance
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
@@ -75,7 +76,7 @@ def _reach(
     x, warm = nearest_reachable(
         part.dynamics,
         around,
-        _rest(rest),
+        _rest(rest, tolerance),
         part.decode(z),
         Pins(pins.mask, part.decode(pins.values)),
         used=used,
@@ -87,10 +88,10 @@ def _reach(
     return pins.paint(part.encode(x)), warm
 
 
-def _rest(parts: Sequence[Part]) -> Callable[[Traj, Pins], Traj] | None:
+def _rest(parts: Sequence[Part], tolerance: float) -> Callable[[Traj, Pins], Traj] | None:
     """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
     if len(parts) == 1 and isinstance(parts[0], Rate):
-        slowed = Slowed(parts[0], Pins(torch.empty(0), torch.empty(0)))
+        slowed = Slowed(parts[0], Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
 
         def slow(p: Traj, held: Pins) -> Traj:
             slowed.pins = held

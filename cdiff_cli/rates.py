@@ -6,7 +6,7 @@ that depends on the pins, the weights and the horizon alone finds the trajectory
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import ClassVar
@@ -135,15 +135,17 @@ class Rate:
 class Slowed:
     """The projection onto one limit with the same pins, again and again: each call begins where the last one ended.
 
+    close  how near the copies are to the differences in the end, environment units; None: 1e-10, in float32 1e-6
     warm   copies of the differences and their scaled multipliers   [k, horizon - 1, batch]
     """
 
     part: Rate
     pins: Pins
-    warm: tuple[Tensor, Tensor] | None = field(default=None)
+    close: float | None = None
+    warm: tuple[Tensor, Tensor] | None = None
 
     def __call__(self, z: Traj) -> Traj:
-        """The nearest trajectory to z within the limit, to 1e-9 of a unit in float64, 1e-5 in float32."""
+        """The nearest trajectory to z within the limit."""
         part, (batch, horizon, _) = self.part, z.shape
         if horizon < 2 or (self.warm is None and not bool((part(z) > 0).any())):
             return z
@@ -158,7 +160,7 @@ class Slowed:
         still, toward = base.diff(dim=1), base + fixed @ (weight[..., None] * target)
         step = target.diff(dim=1)
         copy, dual = self.warm or (part.cut(step), torch.zeros_like(step))
-        close, x = (1e-10 if z.dtype == torch.float64 else 1e-6), target
+        close, x = self.close or (1e-10 if z.dtype == torch.float64 else 1e-6), target
         for k in range(ROUNDS):
             x = toward + M @ (copy - dual - still)
             made = x.diff(dim=1)
