@@ -2,6 +2,8 @@
 lie on its outer side, so chosen that the path slides round on the side on which it passes the centre.
 """
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -62,14 +64,17 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: 
     deepest = torch.where(own, distance[plan, segment], torch.inf).argmin(1, keepdim=True)
     nearest = near[plan, segment.gather(1, deepest)][:, 0]
 
-    across = out - into
-    along, e_in, e_out = _unit(torch.stack((across, into, out)), torch.stack((into, across, across)))
-    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
-    e_mid = _unit(nearest, _sideways(aside, across))
     walked = torch.where(own, length[plan, segment], 0.0)
     until = walked.cumsum(1)
     whole = until[:, -1:]
     share = torch.where(whole > 0, (until - walked / 2) / whole.clamp_min(1e-12), 0.5)  # at the middle of each segment
+    if y.shape[-1] == 2 and bool((nearest.square().sum(-1) > 1e-12).all() & (at.square().sum(-1) > 1e-12).all()):
+        return _turned_in_plane(into, nearest, out, share)[own]
+
+    across = out - into
+    along, e_in, e_out = _unit(torch.stack((across, into, out)), torch.stack((into, across, across)))
+    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
+    e_mid = _unit(nearest, _sideways(aside, across))
     begin, towards = torch.stack((e_in, e_mid)), torch.stack((e_mid, e_out))
     turn, side = _angle(begin, towards), _perpendicular(begin, towards)
     angle = share * (turn[0] + turn[1])
@@ -77,6 +82,20 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: 
     angle = torch.where(second, angle - turn[0], angle)[own][:, None]
     half, run = second[own].long(), own.nonzero()[:, 0]
     return angle.cos() * begin[half, run] + angle.sin() * side[half, run]
+
+
+def _turned_in_plane(into: Tensor, nearest: Tensor, out: Tensor, share: Tensor) -> Tensor:
+    """Unit vectors [runs, longest, 2] that turn from the direction of one point by way of the next to that of the last, [runs, 2]
+    each, evenly in share [runs, longest].
+    """
+    points = torch.stack((into, nearest, out))
+    direction = torch.atan2(points[..., 1], points[..., 0])[..., None]
+    turn = direction[1:] - direction[:-1]
+    turn = turn - 2 * math.pi * torch.round(turn / (2 * math.pi))  # the shorter way
+    size = turn.abs()
+    past = share * (size[0] + size[1]) - size[0]  # the middle
+    angle = direction[1] + past * torch.where(past > 0, turn[1], turn[0]).sign()
+    return torch.stack((angle.cos(), angle.sin()), -1)
 
 
 def _perpendicular(e: Tensor, towards: Tensor) -> Tensor:
