@@ -35,6 +35,7 @@ Expectation = Literal["per_sample", "batch_mean"]
 Positive = Literal["none", "silu"]
 Correction = Literal["kernel", "latent"]
 Coefficient = Literal["beta/2", "one"]
+ADMM_BETWEEN = 2  # rounds on the dynamics between two climbs of primal-dual's multipliers
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,13 @@ class PrimalDual:
     estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
-    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, in
-    `rounds` rounds of ADMM.
+    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, by ADMM,
+    and the multipliers climb `rounds` times a step, with ADMM_BETWEEN of its rounds in between. Once a step is too seldom: what the
+    dynamics let move moves less than the push asks, and multipliers that trail leave to the polish what the network should see.
 
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
+    rounds, dynamics_from   where dynamics are to be obeyed: climbs a step; as in Projected
     expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
@@ -116,13 +119,14 @@ class PrimalDual:
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
         g, dynamics = split(due(g, step.level, self.dynamics_from))
-        flat = turned(g, step.x0, step.pins)
-        rows, pull, size = linearise(flat, step.x0, self.positive)
-        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
-        x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
-        rows, _, size = linearise(flat, x0, self.positive)
-        dual = expect(rows / size.clamp_min(1e-12), self.expectation)
-        return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)
+        flat, x0, warm = turned(g, step.x0, step.pins), step.x0, None
+        rows, pull, _ = linearise(flat, x0, self.positive)
+        for _ in range(self.rounds if dynamics.parts else 1):
+            x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+            x0, warm = project_from(dynamics, x0, step.pins, warm, ADMM_BETWEEN)
+            rows, _, size = linearise(flat, x0, self.positive)
+            lam = (lam + self.eta * expect(rows / size.clamp_min(1e-12), self.expectation)).clamp_min(0)
+        return step.reverse(x0), lam
 
 
 class AlmState(NamedTuple):
