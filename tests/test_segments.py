@@ -14,7 +14,7 @@ from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid
 from cdiff_cli.projection import REFINEMENTS, project
 from cdiff_cli.segments import NEVER, nearest_in_planes, normals, planes
-from tests.problems import F64, ball, chain, half_space, least_distance, normal, num, pin, vec, waypoints
+from tests.problems import F64, ball, chain, least_distance, normal, num, pin, vec, waypoints
 
 SAFE = {F64: 1e-9, torch.float32: 1e-5}  # rounding of coordinates of a few metres, in units of the smallest radius, 0.2
 UNIT = ball(1, centre=(0.0, 0.0), radius=1.0)
