@@ -41,7 +41,7 @@ class Condition:
     def read(cls, path: Path, task: Any) -> "Condition":
         """The constraints of a file; raises SpecError."""
         observable = getattr(task, "observable", ())
-        kinds, g = load_constraints(path, task.name, task.layout, None, observable)
+        kinds, g = load_constraints(path, task.name, task.layout, None, observable, getattr(task, "dt", None))
         waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
         return cls(path.stem, g, content_sha256(kinds), tuple(name for name in observable if name in waits))
 

@@ -14,6 +14,7 @@ from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import Reachable
 from cdiff_cli.observed import Observed
 from cdiff_cli.projection import has_exact_form
+from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.spec import load_constraints
 from cdiff_cli.tasks import load_task
@@ -31,7 +32,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     shipped = home() / "models" / name / "small.safetensors"
     checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(file, name, task.layout, fitted, observable)
+    kinds, g = load_constraints(file, name, task.layout, fitted, observable, getattr(task, "dt", None))
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
@@ -49,7 +50,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
-            "exact" if has_exact_form(form) else "ADMM" if isinstance(form, Reachable) else "sequential (ProxQP)",
+            "ADMM" if isinstance(form, Reachable | Rate) else "exact" if has_exact_form(form) else "sequential (ProxQP)",
             obey,
         )
     out.print(table)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import LinearDynamics
+from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -228,10 +229,10 @@ def _steps(x: Array, columns: Sequence[int]) -> Array:
 
 
 def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
-    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, of dynamics those that no step leads to."""
+    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, else those that no step leads to."""
     level = getattr(part, "level", None)
     values = part(torch.from_numpy(x)) if level is None else level(torch.from_numpy(x))
-    if not part.spans:
+    if not part.spans or isinstance(part, Rate):
         values = torch.nn.functional.pad(values, (1, 0), value=-torch.inf)
     elif level is None:
         values = values.amax(1, keepdim=True)

@@ -23,6 +23,7 @@ from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.margins import tightened
 from cdiff_cli.methods import METHODS, Unconstrained, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
+from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
 from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
 from cdiff_cli.tasks import Task, load_task
@@ -212,7 +213,10 @@ def resolve(options: Options) -> Resolved:
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable)
+    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable, getattr(task, "dt", None))
+    limited = [part.name for part in g.parts if isinstance(part, Rate)]
+    if limited and recipe.frame == "relative":
+        raise CdiffError(f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out')
     steps = preset.steps if options.steps is None else options.steps
     if steps is not None:
         if not 1 <= steps <= schedule.n_steps:
@@ -368,6 +372,13 @@ def parse_state(flag: str, text: str | None, default: dict[str, float] | None, t
     return state
 
 
+def fastest(task: Any, g: Constraint) -> float:
+    """The speed that limits on the change of the positions allow, m/s."""
+    at = {task.layout.index(name) for name in task.positions}
+    own = [part.high for part in g.parts if isinstance(part, Rate) and part.norm and set(part.which.argmax(1).tolist()) == at]
+    return min(own, default=math.inf)
+
+
 def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
     """n random feasible starts and goals [n, dim], at rest: both allowed by the constraints, and the shortest way between
     them no faster over one horizon than 95 % of the data's windows.
@@ -379,6 +390,8 @@ def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tup
         speed = task.path_length(*pair[:, :2]) / ((card.horizon - 1) * task.dt)
         x = torch.from_numpy(pair)
         levels = [level for part in g.parts if (level := getattr(part, "level", None)) is not None]
+        if speed > fastest(task, g):
+            continue
         if speed <= card.data["speed_q95"] and all(bool((level(x) <= 0).all()) for level in levels):
             starts.append(pair[0])
             goals.append(pair[1])
