@@ -1,8 +1,9 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
+CALIBRATE := rollout --calibrate --level 0.99 --episodes 100 --seed 5000
 SLALOM := --constraints constraints/maze2d-umaze-slalom.yaml
 
-.PHONY: demo test lint tables benchmark oracle experts clean
+.PHONY: demo test lint tables benchmark oracle experts margins clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
 	$(BIN)/cdiff plan --method diffuser $(SLALOM) --runs runs/demo --json >/dev/null
@@ -28,9 +29,15 @@ benchmark: .venv/.ready  ## timings, as ratios within one run
 oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
 	$(BIN)/python tests/benchmarks/oracle.py
 
-experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 12 minutes
+experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 20 minutes
 	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1
-	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0
+	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 5
+
+margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour
+	for c in hopper hopper-hard swimmer swimmer-hard; do for m in alm projected primal-dual safediffuser; do \
+		$(BIN)/cdiff $(CALIBRATE) --task $${c%-hard} --constraints constraints/$$c.yaml --method $$m || exit 1; done; done
+	for c in hopper swimmer; do for k in 2 4 8; do \
+		$(BIN)/cdiff $(CALIBRATE) --task $$c --execute $$k || exit 1; done; done
 
 .venv/.ready: requirements.txt pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv

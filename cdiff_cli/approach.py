@@ -36,18 +36,19 @@ class Approach:
     convex = False
 
     def __call__(self, x: Tensor) -> Tensor:
-        length, normal, rate, _ = self._parts(x)
-        return self.radius - length - self.time * (normal * rate).sum(-1)
+        length, _, _, closing = self._sight(x)
+        return self.radius - length - self.time * closing
 
-    def _parts(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """|y|, y / |y|, w and w across the line of sight, over |y|."""
+    def _sight(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """|y|, y / |y|, w and w along the line of sight, (y / |y|).w."""
         y = times(x, self.which.mT) - self.centre
         length = y.norm(dim=-1).clamp_min(NEAREST)
         normal, rate = y / length[..., None], times(x, self.rates.mT) - self.drift
-        return length, normal, rate, (rate - (normal * rate).sum(-1, keepdim=True) * normal) / length[..., None]
+        return length, normal, rate, (normal * rate).sum(-1)
 
     def gradient(self, x: Tensor) -> Tensor:
-        _, normal, _, across = self._parts(x)
+        length, normal, rate, closing = self._sight(x)
+        across = (rate - closing[..., None] * normal) / length[..., None]
         return -times(normal + self.time * across, self.which) - times(self.time * normal, self.rates)
 
     def size(self, x: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint, Part
 from cdiff_cli.levels import Level
+from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -133,19 +134,20 @@ def _at_waypoints(part: Part, x: Array, task: Task) -> list[Entry]:
 def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
     """The worst value on the straight segments between the waypoints of each plan, and the first point that has it.
 
-    A part over a level has the exact maximum (Level.worst), one that asks nothing between waypoints its own values; of any
-    other it is only what was found, and no promise.
+    A part over a level has the exact maximum (Level.worst), one that asks nothing between waypoints its own values, a rate is the
+    same all along a segment, whose beginning is named; of any other it is only what was found, and no promise.
     """
     level: Level | None = getattr(part, "level", None)
-    exact = level is not None or not part.spans
+    steady = isinstance(part, Rate)
+    exact = level is not None or steady or not part.spans
     rows = _values(part.segment_max(_tensor(x)))
     at = [_first_worst(values) for values in rows]
-    if level is None or any(segment is None for segment in at):
+    if (level is None and not steady) or any(segment is None for segment in at):
         places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
     else:
         plan, segment = np.arange(len(x)), np.array(at)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = level.worst(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
+        share = np.zeros(len(x)) if level is None else level.worst(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}

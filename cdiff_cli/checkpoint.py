@@ -11,6 +11,7 @@ import yaml
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from cdiff_cli.conditioning import Telling
 from cdiff_cli.data import Normaliser
 from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.errors import CheckpointError
@@ -30,6 +31,7 @@ class Checkpoint:
     demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
     dynamics         linear dynamics fitted to the training data, environment units; None where there were no inputs to fit
     frame, inverse   of control tasks: the relative windows, and u = IDM(x^0, x^1)
+    telling          of planners conditioned on what they observe: how they are told
     """
 
     net: Network
@@ -40,6 +42,7 @@ class Checkpoint:
     dynamics: LinearDynamics | None = None
     frame: Frame | None = None
     inverse: InverseDynamics | None = None
+    telling: Telling | None = None
 
 
 def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:
@@ -139,6 +142,7 @@ def load_checkpoint(path: Path, task: str | None = None, device: torch.device | 
         dynamics,
         Frame(normaliser, **parts["frame"]) if "frame" in parts else None,
         _inverse(parts["inverse"], device) if "inverse" in parts else None,
+        Telling(**parts["telling"]) if "telling" in parts else None,
     )
 
 

@@ -107,11 +107,9 @@ def train(
     plan = load_recipe(task)
     condition = None
     if conditional is not None:
-        from cdiff_cli.conditioning import Condition, content_sha256
-        from cdiff_cli.spec import load_constraints
+        from cdiff_cli.conditioning import Condition
 
-        kinds, g = load_constraints(conditional, problem.name, problem.layout)
-        condition = Condition(conditional.stem, g, content_sha256(kinds))
+        condition = Condition.read(conditional, problem)
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe
     work = runs / f"train-{task}-{name}-{seed}"
@@ -157,7 +155,8 @@ def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     groups = compare([{k: float(v) if isinstance(v, int) and k != "seed" else v for k, v in row.items()} for row in finished.rows])
     if as_json:
         found = json.loads(render(groups, table, "json"))
-        typer.echo(json.dumps({"run": str(finished.path), "summary": found, "certificate": finished.counts}))
+        said = {"run": str(finished.path), "summary": found, "certificate": finished.counts, "notes": list(finished.notes)}
+        typer.echo(json.dumps(said))
     else:
         transposed(groups[0], table)
         for note in finished.notes:
@@ -357,17 +356,17 @@ def sweep(
     runs: RunsFolder = RUNS,
 ) -> None:
     """Make the missing runs of a matrix (task, constraints, preset, method, seed); start it again and it goes on. Exit code 1 where
-    a run failed. `cdiff compare` then prints the table.
+    a run failed or diverged. `cdiff compare` then prints the table.
     """
     from cdiff_cli.sweep import Matrix, run_sweep
 
     tasks, named, asked = ([name.strip() for name in text.split(",") if name.strip()] for text in (task, methods, presets))
     matrix = Matrix(tasks, named, asked, constraints or [None], range(seed, seed + seeds), rollout, random)
-    failed = run_sweep(matrix, runs, jobs, err, backend, address)
-    for outcome in failed:
-        typer.echo(f"failed: {outcome.job.name}: {outcome.error}", err=True)
+    troubled = run_sweep(matrix, runs, jobs, err, backend, address)
+    for outcome in troubled:
+        typer.echo(outcome.trouble, err=True)
     typer.echo(f"compare them with: cdiff compare {runs}")
-    raise typer.Exit(1 if failed else 0)
+    raise typer.Exit(1 if troubled else 0)
 
 
 @app.command()

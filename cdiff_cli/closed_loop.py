@@ -12,11 +12,13 @@ import numpy as np
 
 from cdiff_cli import control_figures, metrics
 from cdiff_cli.baselines import BestOf
+from cdiff_cli.calibrations import Calibration, Margin, write_calibration
+from cdiff_cli.conditioning import content_sha256
 from cdiff_cli.control import Controller, control
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
-from cdiff_cli.margins import Margin, Margins, conformal, errors, require_enough, write_margins
+from cdiff_cli.margins import conformal, errors, require_enough
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
 from cdiff_cli.request import Resolved
@@ -46,11 +48,19 @@ def control_run(
     warning = f"{_diverged(done)}; what they had done until then is kept" if done.diverged.any() else ""
     counts = {"episodes": len(rows), "safe_executed": int(sum(row["safe_executed"] for row in rows))}
     verdict = f"executed     {counts['safe_executed']} of {len(rows)} episodes safe at every step"
-    return Finished(run.path, rows, run.path / "rollout.png", cast(Any, counts), verdict, warning=warning)
+    notes = (resolved.note,) if resolved.note else ()
+    return Finished(run.path, rows, run.path / "rollout.png", cast(Any, counts), verdict, notes=notes, warning=warning)
 
 
-def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margins]:
-    """Act without a margin, and write the margins that cover how far execution left the plans, beside the checkpoint."""
+def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Calibration]:
+    """Fit margins to what was asked for, and write them beside the checkpoint."""
+    assert resolved.checkpoint is not None
+    found = fit_margins(resolved, tick, level)
+    return write_calibration(resolved.checkpoint.path, found), found
+
+
+def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
+    """Act without a margin, and take those that cover how far execution left the plans."""
     require_enough(resolved.options.n, level)
     acting, checkpoint = controller(resolved), resolved.checkpoint
     assert checkpoint is not None
@@ -65,16 +75,17 @@ def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Margi
         )
         for part, each in zip(acting.g.parts, scores.T, strict=True)
     }
-    found = Margins(
+    return Calibration(
+        stem=resolved.constraints_path.stem,
+        content=content_sha256(resolved.kinds),
+        constraints={kind.name: kind.describe() for kind in resolved.kinds},
+        conditions=resolved.conditions,
         level=level,
         episodes=len(scores),
         seed=resolved.options.seed,
         weights_sha256=checkpoint.card.weights_sha256,
-        method=resolved.options.method,
-        preset=resolved.options.preset,
-        constraints=by_name,
+        margins=by_name,
     )
-    return write_margins(checkpoint.path, resolved.constraints_path.stem, found), found
 
 
 def _diverged(done: Episodes) -> str:
@@ -88,21 +99,19 @@ def controller(resolved: Resolved) -> Controller:
     problem, preset, options, checkpoint = resolved.problem, resolved.preset, resolved.options, resolved.checkpoint
     if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
         raise CdiffError(f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff")
-    if isinstance(resolved.method, BestOf):
-        raise CdiffError(f"{options.method}: only for whole plans, and {problem.task.name} plans anew at each step; choose another")
-    execute = preset.execute if options.execute is None else options.execute
+    execute, warm = resolved.conditions.execute, resolved.conditions.warm
     inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
     ahead = 1 if inverse is None else inverse.ahead
     if not 1 <= execute <= problem.horizon - ahead:
         raise CdiffError(
             f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
         )
-    warm = preset.warm if options.warm is None else options.warm
     if warm is not None and not 0 < warm <= 1:
         raise CdiffError(f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}")
     return Controller(
         task=cast(ControlTask, problem.task),
         denoiser=resolved.guided or problem.denoiser,
+        seeing=resolved.seeing,
         schedule=problem.schedule,
         frame=checkpoint.frame,
         inverse=checkpoint.inverse,
@@ -111,12 +120,13 @@ def controller(resolved: Resolved) -> Controller:
         method=resolved.method,
         device=problem.device,
         kernel=resolved.kernel,
-        extra_steps=resolved.extra_steps,
-        polish=preset.polish and not isinstance(resolved.method, Unconstrained),
+        extra_steps=resolved.conditions.extra_steps,
+        polish=preset.polish and not isinstance(resolved.method, Unconstrained | BestOf),
         temperature=preset.temperature,
         ahead=ahead,
         execute=execute,
         warm=warm,
+        resume=preset.resume,
         brake=getattr(problem.task, "brake", None),
         action_noise=options.action_noise,
     )
@@ -173,7 +183,7 @@ def _write(path: Path, resolved: Resolved, acting: Controller, done: Episodes, r
     write_rows(path / "rows.csv", rows)
 
 
-def calibrated_text(path: Path, found: Margins) -> str:
+def calibrated_text(path: Path, found: Calibration) -> str:
     """What `cdiff rollout --calibrate` prints."""
-    each = "; ".join(f"{name} {m.margin:g} (median {m.median:g}, largest {m.largest:g})" for name, m in found.constraints.items())
+    each = "; ".join(f"{name} {m.margin:g} (median {m.median:g}, largest {m.largest:g})" for name, m in found.margins.items())
     return f"margins at level {found.level:g} from {found.episodes} episodes: {each}\nwritten to {shown(path)}"

@@ -1,9 +1,10 @@
-"""Classifier-free conditioning on constraints: labels of training windows, and the guided clean estimate."""
+"""Classifier-free conditioning on constraints: labels of training windows, what is observed beside them, the guided estimate."""
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,8 +12,14 @@ from torch import Tensor, nn
 
 from cdiff_cli.constraint import Constraint, Traj
 from cdiff_cli.diffusion import Denoiser
+from cdiff_cli.observed import Observed, Seen
+from cdiff_cli.spec import load_constraints
+
+Seeing = Callable[[Seen, Tensor], Denoiser]
+"""(what is observed now, the present states [n, dim]) -> the clean estimate of a planner that is told of it."""
 
 LABELS = 2  # entries of a label
+LEAST = 1e-6  # scale of a quantity that is the same throughout
 
 
 @dataclass(frozen=True)
@@ -22,16 +29,63 @@ class Condition:
     name      of the constraint file, without its ending
     g         environment units
     sha256    of what the file says, comments left out
+    observed  names of the quantities that g waits for
     """
 
     name: str
     g: Constraint
     sha256: str
+    observed: tuple[str, ...] = ()
 
-    def label(self, x: Traj) -> Tensor:
-        """(1 where a window obeys g, else -1; its largest g clipped to [0, 1]) [batch, 2]. x in environment units."""
-        worst = self.g.to(x)(x).amax(1)
+    @classmethod
+    def read(cls, path: Path, task: Any) -> "Condition":
+        """The constraints of a file; raises SpecError."""
+        observable = getattr(task, "observable", ())
+        kinds, g = load_constraints(path, task.name, task.layout, None, observable, getattr(task, "dt", None))
+        waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
+        return cls(path.stem, g, content_sha256(kinds), tuple(name for name in observable if name in waits))
+
+    @property
+    def entries(self) -> int:
+        """What a network is told: a label, and each quantity."""
+        return LABELS + len(self.observed)
+
+    def label(self, x: Traj, seen: Seen | None = None, dt: float = 1.0) -> Tensor:
+        """(1 where a window obeys g, else -1; its largest g clipped to [0, 1]) [batch, 2]. x in environment units.
+
+        seen   what is observed at the first waypoint of each window
+        dt     seconds between waypoints
+        """
+        g = self.g.bind(seen or {}, dt, x.shape[1])
+        worst = g.to(x)(x).amax(1)
         return torch.stack((torch.where(worst <= 0, 1.0, -1.0), worst.clamp(0.0, 1.0).float()), 1)
+
+
+@dataclass(frozen=True)
+class Telling:
+    """How observed quantities are told to a network: those called after a coordinate (obstacle.x, after x) relative to it as it is
+    at present, all of them in standard deviations.
+
+    columns         the coordinate that each is relative to, -1: none   [k]
+    centre, scale   of what is told, over the training data             [k]
+    """
+
+    columns: Tensor
+    centre: Tensor
+    scale: Tensor
+
+    @classmethod
+    def fit(cls, names: Sequence[str], layout: Sequence[str], seen: Sequence[Tensor], present: Tensor) -> "Telling":
+        """The scales of the data: quantities, in order, each [n], and the states [n, dim] that they were seen from."""
+        last = [name.rpartition(".")[2] for name in names]
+        columns = torch.tensor([layout.index(name) if name in layout else -1 for name in last])
+        plain = cls(columns, torch.zeros(len(names)), torch.ones(len(names)))(seen, present)
+        return cls(columns, plain.mean(0), plain.std(0).clamp_min(LEAST))
+
+    def __call__(self, seen: Sequence[Tensor], present: Tensor) -> Tensor:
+        """What the network is told [n, k] of the quantities, in order, each [n], seen from the states [n, dim]."""
+        origin = torch.where(self.columns >= 0, present[:, self.columns], 0.0)
+        return ((torch.stack(tuple(seen), 1) - origin).float() - self.centre) / self.scale
 
 
 def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -46,18 +100,21 @@ def content_sha256(kinds: Sequence[Any]) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
-def guided(net: nn.Module, weight: float, limit: float = 1.0) -> Denoiser:
+def guided(net: nn.Module, weight: float, limit: float = 1.0, told: Tensor | None = None) -> Denoiser:
     """x0 = x0(no condition) + weight (x0(obeys) - x0(no condition)) (Ho and Salimans, 2022, Eq. 6 for estimates of x0), clipped to
     the data's limits. Both estimates are made in one batch; weight 1 needs the conditioned one alone.
+
+    told   what is observed, beside the label [batch, k]
     """
 
     def clean(x: Traj, t: int) -> Traj:
-        obeys = torch.tensor([1.0, 0.0], device=x.device)
+        asked = torch.tensor([1.0, 0.0], device=x.device).expand(len(x), -1)
+        asked = asked if told is None else torch.cat((asked, told.to(asked)), 1)
         steps = torch.full((len(x),), float(t), device=x.device)
         if weight == 1.0:
-            return net(x, steps, obeys.expand(len(x), -1)).clamp(-limit, limit)
-        label = torch.cat((obeys.expand(len(x), -1), torch.zeros(len(x), LABELS, device=x.device)))
-        asked, free = net(torch.cat((x, x)), torch.cat((steps, steps)), label).chunk(2)
-        return (free + weight * (asked - free)).clamp(-limit, limit)
+            return net(x, steps, asked).clamp(-limit, limit)
+        both = net(torch.cat((x, x)), torch.cat((steps, steps)), torch.cat((asked, torch.zeros_like(asked))))
+        obeys, free = both.chunk(2)
+        return (free + weight * (obeys - free)).clamp(-limit, limit)
 
     return clean

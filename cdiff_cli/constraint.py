@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from cdiff_cli.affine_rows import AffineRows
 from cdiff_cli.levels import Framed, Level, Quadric, moved, segment_max, take
 
 Traj = Float[Tensor, "batch horizon dim"]
@@ -304,18 +305,29 @@ class Bindable(Protocol):
 
 @dataclass(frozen=True)
 class Constraint:
-    """g(x) <= 0, row by row: a tuple of parts, each in environment units or all pulled back."""
+    """g(x) <= 0, row by row: a tuple of parts, each in environment units or all pulled back.
+
+    condensed   the rows of all parts at once, where they are affine and someone has written them so (condensed.py)
+    """
 
     parts: tuple[Part, ...]
+    condensed: AffineRows | None = None
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether a part waits for observed quantities."""
+        return any(isinstance(part, Bindable) for part in self.parts)
 
     def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> "Constraint":
         """The constraint with observed quantities filled in, each [batch], at waypoints dt seconds apart."""
-        if not any(isinstance(part, Bindable) for part in self.parts):
+        if not self.waits:
             return self
         bound = [part.bind(observed, dt, horizon) if isinstance(part, Bindable) else (part,) for part in self.parts]
         return Constraint(tuple(part for parts in bound for part in parts))
 
     def __call__(self, x: Traj) -> Rows:
+        if self.condensed is not None:
+            return self.condensed(x)
         rows = [part(x) for part in self.parts]
         return torch.cat(rows, 1) if rows else x.new_zeros(len(x), 0)
 
@@ -326,6 +338,8 @@ class Constraint:
         """g(x) [batch, n]; the pull w -> w^T dg/dx without a Jacobian; and row by row a bound of the largest eigenvalue
         that the row can give to J J^T, for step sizes.
         """
+        if self.condensed is not None:
+            return self.condensed.linearise(x)
         each = [part.linearise(x) for part in self.parts]
         if not each:
             empty = x.new_zeros(len(x), 0)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -10,14 +11,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cdiff_cli.affine_rows import AffineRows
+from cdiff_cli.baselines import BestOf
+from cdiff_cli.condensed import condensed
+from cdiff_cli.conditioning import Seeing
 from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
+from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
 from cdiff_cli.episodes import Episodes, Log
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
-from cdiff_cli.methods import AlmState
+from cdiff_cli.methods import AlmState, Unconstrained
 from cdiff_cli.networks import InverseDynamics
-from cdiff_cli.planning import MARGIN, Timed, synchronise
+from cdiff_cli.observed import Seen
+from cdiff_cli.planning import MARGIN, Timed, candidate_seed, synchronise
 from cdiff_cli.projection import project_from
 from cdiff_cli.tasks import ControlTask
 
@@ -29,6 +36,7 @@ TOLERANCE = 1e-3  # of a finished plan's g, environment units: beyond it the pro
 class Controller:
     """All that acting needs, resolved.
 
+    seeing        the denoiser of a planner that is told what is observed, anew at each plan; None of the others
     g             as declared: what is scored                                    environment units
     enforced      what plans obey: g, tightened by the margin                    environment units
     temperature   factor on all noise: below 1 plans stay nearer the mean
@@ -36,6 +44,7 @@ class Controller:
     execute       environment steps a plan is followed
     warm          share of the diffusion steps done again on the last plan, moved on by what was executed, from the multipliers
                   it ended with, moved on likewise; None: all, from noise
+    resume        begin each plan from the multipliers that the last one ended with, as they are
     brake         state -> input that is used where the last projection leaves a plan outside of what it was to obey; None: the
                   plan's own
     action_noise  standard deviation of what is added to each input, over half its range: a disturbance, not ours to know
@@ -57,18 +66,34 @@ class Controller:
     ahead: int = 1
     execute: int = 1
     warm: float | None = None
+    resume: bool = False
     brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
+    seeing: Seeing | None = None
 
     @property
     def horizon(self) -> int:
         return self.frame.mean.shape[0]
 
+    @cached_property
+    def condensed(self) -> AffineRows | None:
+        """The rows of what is obeyed as one matrix, float64, where they are affine and nothing has to be observed."""
+        return condensed(self.enforced, self.horizon, len(self.task.layout))
+
+    @property
+    def redone(self) -> int:
+        """Diffusion steps a plan, the first of an episode apart where plans are warm."""
+        return self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
+
+    @property
+    def tries(self) -> int:
+        """Plans made of which one is kept."""
+        return self.method.k if isinstance(self.method, BestOf) else 1
+
     @property
     def calls(self) -> int:
-        """Network calls a plan, the first of an episode apart where plans are warm."""
-        steps = self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
-        return steps + self.extra_steps
+        """Network calls a control step at which plans are made."""
+        return self.tries * (self.redone + self.extra_steps)
 
 
 def control(
@@ -87,7 +112,7 @@ def control(
     task = controller.task
     total = task.max_steps if steps is None else steps
     envs = [task.make_env(**(env_options or {})) for _ in seeds]
-    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    generators = [[torch.Generator().manual_seed(candidate_seed(seed, j)) for j in range(controller.tries)] for seed in seeds]
     disturbances = [np.random.default_rng((seed, 1)) for seed in seeds]
     low, high = envs[0].action_space.low, envs[0].action_space.high
     log = Log(task, len(controller.g.parts), len(seeds), total)
@@ -95,13 +120,15 @@ def control(
         states = np.stack([task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)])
         log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
         alive, plans, since = np.arange(len(seeds)), np.empty((len(seeds), controller.horizon, states.shape[1])), 0
-        method, stuck = _Resumed(controller.method, controller.execute), np.zeros(len(seeds), dtype=bool)
+        shift = 0 if controller.warm is None else controller.execute
+        method, stuck, before = _Resumed(controller.method, shift), np.zeros(len(seeds), dtype=bool), alive
         while log.done < total and len(alive):
             tau = log.done
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
-                method = _Resumed(controller.method, controller.execute, method.state if last is not None else None)
-                draws = _draws(controller, [generators[i] for i in alive])
+                goes_on = last is not None or controller.resume
+                method = _Resumed(controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None)
+                before, draws = alive, _draws(controller, [each for i in alive for each in generators[i]])
                 found = _plan(controller, method, _Asked(states[alive], log.now(alive), last, draws))
                 plans[alive] = found.x
                 log.plan(tau, alive, found.x, found.g, found.total_s, found.network_s)
@@ -140,32 +167,14 @@ def control(
     return log.episodes()
 
 
-@dataclass(frozen=True)
-class _InUnits:
-    """The method on coordinates y = scale * z, which have the units of the environment: what is near is measured there. The scales
+def _in_units(denoiser: Denoiser, scale: Tensor) -> Denoiser:
+    """The denoiser on coordinates y = scale z, which have the units of the environment: what is near is measured there. The scales
     of z differ a hundredfold along the window, and a method on z would leave the first waypoints, which are all that is
-    executed, as they are. The reverse step is linear, so that it is the same step in y.
+    executed, as they are. The reverse steps are linear and without a constant, so that they are the same in y.
 
     scale   [horizon, dim]
     """
-
-    method: Method
-    scale: Tensor
-
-    def init(self, x: Traj, g: Constraint) -> Any:
-        return self.method.init(x, g)
-
-    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
-        scale = self.scale
-        y = replace(
-            step,
-            x=scale * step.x,
-            x0=scale * step.x0,
-            reverse=lambda clean: scale * step.reverse(clean / scale),
-            pins=Pins(step.pins.mask, scale * step.pins.values),
-        )
-        out, state = self.method.step(y, g, state)
-        return out / scale, state
+    return lambda y, t: scale * denoiser(y / scale, t)
 
 
 @dataclass
@@ -173,7 +182,7 @@ class _Resumed:
     """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
     to be found again in the few steps of a warm plan.
 
-    state   of the method after its last step
+    state   of the method after its last step; None to begin anew
     """
 
     method: Method
@@ -190,8 +199,15 @@ class _Resumed:
         x, self.state = self.method.step(step, g, state)
         return x, self.state
 
+    def of(self, which: NDArray[np.bool_]) -> Any:
+        """The state of some of the episodes alone; multipliers that all share are theirs too."""
+        state, some = self.state, torch.from_numpy(which)
+        if isinstance(state, AlmState):
+            return state._replace(lam=state.lam[some] if len(state.lam) == len(some) else state.lam)
+        return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
+
     def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on part by part, the new ones at the end as they begin; all as they begin where an episode ended."""
+        """The last rows moved on part by part, the new ones at the end as they begin."""
         if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
             return fresh
         out, at = fresh.clone(), 0
@@ -217,7 +233,7 @@ class _Found:
 
 class _Asked(NamedTuple):
     """What plans of one control step begin from: states [n, dim], observed quantities [n], the last plans [n, horizon, dim] where
-    they are carried on, noise [n, count, horizon, dim].
+    they are carried on, noise [n tries, count, horizon, dim].
     """
 
     states: Array
@@ -225,22 +241,26 @@ class _Asked(NamedTuple):
     last: Array | None
     draws: Tensor
 
-    def one(self, i: int) -> "_Asked":
-        """The same of one episode."""
-        which = slice(i, i + 1)
+    def of(self, which: Any, draws: Tensor) -> "_Asked":
+        """The same of some of the episodes, or of each several times, with that noise."""
         seen = {name: values[which] for name, values in self.observed.items()}
-        return _Asked(self.states[which], seen, None if self.last is None else self.last[which], self.draws[which])
+        return _Asked(self.states[which], seen, None if self.last is None else self.last[which], draws)
+
+    @property
+    def seen(self) -> Seen:
+        return {name: torch.from_numpy(values) for name, values in self.observed.items()}
 
     def bind(self, g: Constraint, controller: Controller) -> Constraint:
         """g as it is now."""
-        seen = {name: torch.from_numpy(values) for name, values in self.observed.items()}
-        return g.bind(seen, controller.task.dt, controller.horizon)
+        return g.bind(self.seen, controller.task.dt, controller.horizon)
 
 
 def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
     """Plans for all. Where one of several cannot be, the others are made without it; one that cannot be is to stay where it is, and
     missed.
     """
+    if isinstance(controller.method, BestOf):
+        return _best_of(controller, asked)
     began = time.perf_counter()
     try:
         return _plan_together(controller, method, asked)
@@ -251,53 +271,63 @@ def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
     if n == 1:
         stay = asked.states[:, None].repeat(controller.horizon, 1)
         return _Found(stay, scored, np.ones(1, dtype=bool), time.perf_counter() - began, 0.0)
-    each = [_plan(controller, controller.method, asked.one(i)) for i in range(n)]
+    each = [_plan(controller, controller.method, asked.of([i], asked.draws[i : i + 1])) for i in range(n)]
     x, missed = np.concatenate([found.x for found in each]), np.concatenate([found.missed for found in each])
     return _Found(x, scored, missed, time.perf_counter() - began, sum(found.network_s for found in each))
 
 
+def _best_of(controller: Controller, asked: _Asked) -> _Found:
+    """Of `tries` unconstrained plans an episode the one with the least sum of [g]_+, g as enforced; the first among equals."""
+    n, k = len(asked.states), controller.tries
+    many = asked.of(np.repeat(np.arange(n), k), asked.draws)
+    found = _plan_together(controller, Unconstrained(), many)
+    unsafe = many.bind(controller.enforced, controller)(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
+    best = np.nan_to_num(unsafe, nan=np.inf).reshape(n, k).argmin(1) + k * np.arange(n)
+    scored = asked.bind(controller.g, controller)
+    return _Found(found.x[best], scored, found.missed[best], found.total_s, found.network_s)
+
+
 def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Found:
     states, _, last, draws = asked
-    device, horizon, timed = controller.device, controller.horizon, Timed(controller.denoiser, controller.device)
+    device, horizon = controller.device, controller.horizon
     synchronise(device)
     began = time.perf_counter()
     with torch.inference_mode():
         here = torch.from_numpy(states)
-        to = controller.frame.at(here)
-        scored, obeyed = (asked.bind(g, controller) for g in (controller.g, controller.enforced))
-        like = torch.empty(0, device=device)
-        unit = torch.ones_like(to.scale)
+        timed = Timed(controller.denoiser if controller.seeing is None else controller.seeing(asked.seen, here), device)
+        to, like = controller.frame.at(here), torch.empty(0, device=device)
+        scale, unit = to.scale.to(like), torch.ones_like(here[0])
+        scored = asked.bind(controller.g, controller)
+        obeyed = scored if controller.enforced is controller.g else asked.bind(controller.enforced, controller)
         g = pull_back(obeyed, to.centre, unit).to(like)
-        shape = (horizon, states.shape[1])
-        mask = torch.zeros(shape, dtype=torch.bool, device=device)
+        if controller.condensed is not None:
+            g = replace(g, condensed=controller.condensed.about(to.centre, like))
+        mask = torch.zeros((horizon, states.shape[1]), dtype=torch.bool, device=device)
         mask[0] = True
-        begin = to.encode(here[:, None].expand(-1, horizon, -1))
-        pins = Pins(mask, begin.to(like))
+        begin = here[:, None] - to.centre
         schedule, first = controller.schedule, None
-        noise = iter(draws.to(device).unbind(1))
+        noise = iter((scale * draws.to(device)).unbind(1))
         if last is not None:
-            steps = controller.calls - controller.extra_steps
-            schedule = schedule.until(steps)
-            moved = np.concatenate((last[:, controller.execute :], last[:, -1:].repeat(controller.execute, 1)), 1)
+            schedule = schedule.until(controller.redone)
             a = schedule.alpha_bar[-1]
-            first = (a**0.5 * to.encode(torch.from_numpy(moved)).to(like)) + (1 - a) ** 0.5 * next(noise)
-        z = sample(
-            timed,
+            first = a**0.5 * _moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
+        y = sample(
+            _in_units(timed, scale),
             schedule,
-            _InUnits(method, to.scale.to(like)),
+            method,
             g,
-            pins,
+            Pins(mask, begin.to(like)),
             lambda: next(noise),
             kernel=KERNELS[controller.kernel],
             extra_steps=controller.extra_steps,
             first=first,
         )
-        z64 = z.double().cpu()
-        if controller.polish:
+        y64 = y.double().cpu()
+        inside = obeyed if controller.condensed is None else replace(obeyed, condensed=controller.condensed)
+        if controller.polish and bool((inside(to.centre + y64) > -MARGIN).any()):
             g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
-            y, _ = project_from(g64, to.scale * z64, Pins(mask.cpu(), to.scale * begin), None, 0)
-            z64 = y / to.scale
-        x = to.decode(z64).numpy()
+            y64, _ = project_from(g64, y64, Pins(mask.cpu(), begin), None, 0)
+        x = (to.centre + y64).numpy()
         x[:, 0] = states
         missed = np.zeros(len(x), dtype=bool)
         if controller.polish and controller.brake is not None:
@@ -306,7 +336,16 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
     return _Found(x, scored, missed, time.perf_counter() - began, timed.seconds)
 
 
+def _moved_on(to: Normaliser, last: Array, steps: int) -> Tensor:
+    """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
+    reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
+    """
+    y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - to.centre
+    y[:, -steps:] = 0.0
+    return y
+
+
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:
-    """Noise for a whole plan, one generator an episode [n, steps + 1, horizon, dim]."""
+    """Noise for a whole plan, one generator a plan [n, steps + 1, horizon, dim]."""
     shape = (controller.schedule.n_steps + 1, controller.horizon, len(controller.task.layout))
     return controller.temperature * torch.stack([torch.randn(shape, generator=generator) for generator in generators])

@@ -104,9 +104,13 @@ class Windows:
         """Windows number `index` [k] as [k, horizon, dim]."""
         return self.states[self.starts[index][:, None] + torch.arange(self.horizon)]
 
-    def draw(self, n: int, generator: torch.Generator) -> Tensor:
+    def pick(self, n: int, generator: torch.Generator) -> Tensor:
+        """Numbers of n windows [n]."""
         where = torch.rand(n, generator=generator, dtype=torch.float64) * self.cumulative[-1]
-        return self[torch.searchsorted(self.cumulative, where).clamp_max(len(self.starts) - 1)]
+        return torch.searchsorted(self.cumulative, where).clamp_max(len(self.starts) - 1)
+
+    def draw(self, n: int, generator: torch.Generator) -> Tensor:
+        return self[self.pick(n, generator)]
 
 
 def demonstrations(task: Task, steps: int, seed: int, progress: Progress | None = None) -> list[Array]:

@@ -147,6 +147,8 @@ def dynamics_of(g: Constraint) -> list[Reachable]:
 def split(g: Constraint) -> tuple[Constraint, Constraint]:
     """g without its dynamics, and its dynamics alone."""
     found = dynamics_of(g)
+    if not found:
+        return g, Constraint(())
     return Constraint(tuple(part for part in g.parts if part not in found)), Constraint(tuple(found))
 
 

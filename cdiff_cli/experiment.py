@@ -105,16 +105,16 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
         kernel=resolved.kernel,
         on_step=lambda call: tick("diffuser", call, calls),
     )
-    if isinstance(resolved.method, Unconstrained) and not resolved.extra_steps:
+    if isinstance(resolved.method, Unconstrained) and not resolved.conditions.extra_steps:
         return free, free
-    total = (calls + resolved.extra_steps) * getattr(resolved.method, "k", 1)
+    total = (calls + resolved.conditions.extra_steps) * getattr(resolved.method, "k", 1)
     problem = replace(resolved.problem, denoiser=resolved.guided or resolved.problem.denoiser)
     plans = plan(
         problem,
         resolved.method,
         resolved.seeds,
         kernel=resolved.kernel,
-        extra_steps=resolved.extra_steps,
+        extra_steps=resolved.conditions.extra_steps,
         polish=resolved.preset.polish,
         on_step=lambda call: tick(resolved.options.method, call, total),
     )

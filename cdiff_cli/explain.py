@@ -10,10 +10,11 @@ from rich.table import Table
 from cdiff_cli import figures
 from cdiff_cli.checkpoint import load_checkpoint
 from cdiff_cli.config import Document
-from cdiff_cli.constraint import Constraint
+from cdiff_cli.constraint import Constraint, Part
 from cdiff_cli.dynamics import Reachable
 from cdiff_cli.observed import Observed
 from cdiff_cli.projection import has_exact_form
+from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.spec import load_constraints
 from cdiff_cli.tasks import load_task
@@ -31,7 +32,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     shipped = home() / "models" / name / "small.safetensors"
     checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(file, name, task.layout, fitted, observable)
+    kinds, g = load_constraints(file, name, task.layout, fitted, observable, getattr(task, "dt", None))
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
@@ -49,7 +50,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
             escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
-            "exact" if has_exact_form(form) else "active set" if isinstance(form, Reachable) else "sequential (ProxQP)",
+            _projection(form),
             obey,
         )
     out.print(table)
@@ -64,3 +65,12 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
     figures.constraint_picture(picture, task, fixed, sample, file.stem)
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
+
+
+def _projection(form: Part) -> str:
+    """How the nearest trajectory that obeys it is found (projection.py)."""
+    if isinstance(form, Reachable):
+        return "active set"
+    if isinstance(form, Rate):
+        return "ADMM"
+    return "exact" if has_exact_form(form) else "sequential (ProxQP)"

@@ -1,64 +1,21 @@
 """Margins from evidence: how far execution leaves the plan on the unsafe side, and the conformal quantile that covers it."""
 
 import math
-import os
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import Field
 
-from cdiff_cli.config import Dumper, Strict, load
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.errors import CdiffError
 
 Array = NDArray[np.float64]
 
 
-class Margin(Strict):
-    """Of one constraint: `margin` in the units of its barrier h."""
-
-    margin: Annotated[float, Field(ge=0)]
-    median: float
-    largest: float
-
-
-class Margins(Strict):
-    """models/<task>/<recipe>.margins.yaml: by the constraint file's stem, what was calibrated on it.
-
-    level      an episode that is exchangeable with those stays within the margin with at least this probability
-    episodes   number of calibration episodes
-    """
-
-    level: Annotated[float, Field(gt=0, lt=1)]
-    episodes: int
-    seed: int
-    weights_sha256: str
-    method: str
-    preset: str
-    constraints: dict[str, Margin]
-
-
-class MarginFile(Strict):
-    """All of one checkpoint, by the stem of the constraint file."""
-
-    calibrated: dict[str, Margins]
-
-
-def calibrated(checkpoint: Path, weights_sha256: str, stem: str) -> dict[str, float]:
-    """Margin of each constraint of that file by its name, as calibrated with these weights; nothing where they were not."""
-    found = read_margins(checkpoint).get(stem)
-    if found is None or found.weights_sha256 != weights_sha256:
-        return {}
-    return {name: each.margin for name, each in found.constraints.items()}
-
-
 def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
     """g with the levels f <= 0 of the named parts tightened to f <= -margin; h >= margin of a barrier."""
-
+    if not margins:
+        return g
     return Constraint(tuple(part.shift_level(margins.get(part.name, 0.0)) if part.name in margins else part for part in g.parts))
 
 
@@ -95,22 +52,3 @@ def require_enough(n: int, level: float) -> None:
 
 def _rank(n: int, level: float) -> int:
     return math.ceil((n + 1) * level)
-
-
-def margins_path(checkpoint: Path) -> Path:
-    return checkpoint.with_name(checkpoint.name.removesuffix(".safetensors") + ".margins.yaml")
-
-
-def read_margins(checkpoint: Path) -> dict[str, Margins]:
-    path = margins_path(checkpoint)
-    return dict(load(path, MarginFile).calibrated) if path.exists() else {}
-
-
-def write_margins(checkpoint: Path, stem: str, margins: Margins) -> Path:
-    """Beside the checkpoint, those of other constraint files kept; written elsewhere and renamed."""
-    path = margins_path(checkpoint)
-    file = MarginFile(calibrated=read_margins(checkpoint) | {stem: margins})
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(yaml.dump(file.model_dump(mode="json"), Dumper=Dumper, sort_keys=False))
-    os.replace(partial, path)
-    return path

@@ -28,7 +28,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project_from
 from cdiff_cli.reaching import Warm
 from cdiff_cli.safediffuser import SafeDiffuser
-from cdiff_cli.segments import turned
+from cdiff_cli.segments import Turned, apart, crossed, turned
 
 On = Literal["noisy", "clean"]
 DualOn = Literal["noisy", "estimate", "clean"]
@@ -86,10 +86,13 @@ class PrimalDual:
     estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
-    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone.
+    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, and the
+    multipliers climb `rounds` times a step, each time to where that projection ends. Once a step is too seldom: what the dynamics
+    let move moves less than the push asks, and multipliers that trail leave to the polish what the network should see.
 
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
+    rounds, dynamics_from   where dynamics are to be obeyed: climbs a step; as in Projected
     expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
@@ -116,13 +119,14 @@ class PrimalDual:
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
         g, dynamics = split(due(g, step.level, self.dynamics_from))
-        g = turned(g, step.x0, step.pins)
-        rows, pull, size = linearise(g, step.x0, self.positive)
-        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
-        x0, _ = project_from(dynamics, x0, step.pins, None, self.rounds)
-        rows, _, size = linearise(g, x0, self.positive)
-        dual = expect(rows / size.clamp_min(1e-12), self.expectation)
-        return step.reverse(x0), (lam + self.eta * dual).clamp_min(0)
+        flat, x0, warm = turned(g, step.x0, step.pins), step.x0, None
+        rows, pull, _ = linearise(flat, x0, self.positive)
+        for _ in range(self.rounds if dynamics.parts else 1):
+            x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+            x0, warm = project_from(dynamics, x0, step.pins, warm, 1)
+            rows, _, size = linearise(flat, x0, self.positive)
+            lam = (lam + self.eta * expect(rows / size.clamp_min(1e-12), self.expectation)).clamp_min(0)
+        return step.reverse(x0), lam
 
 
 class AlmState(NamedTuple):
@@ -181,11 +185,11 @@ class AugmentedLagrangian:
         if dynamics_of(g):
             x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
             return step.reverse(x0), AlmState(lam, rho, warm)
-        g = turned(g, step.x0, step.pins)
-        rows, pull, _ = linearise(g, step.x0, self.positive)
+        flat = turned(g, step.x0, step.pins)
+        rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         for _ in range(self.inner):
-            rows, pull, size = linearise(g, x0, self.positive)
+            rows, pull, size = linearise(flat, x0, self.positive)
             lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
             x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         return step.reverse(x0), AlmState(lam, self._grown(rho))
@@ -244,10 +248,20 @@ def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
 
 def idle(g: Constraint, step: Step, lam: Rows) -> bool:
     """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
-    return not dynamics_of(g) and not bool(lam.any()) and not bool((g(step.x0) > 0).any())
+    if dynamics_of(g) or _positive(lam):
+        return False
+    round_, others = apart(g)
+    if round_ and bool(crossed(round_, step.x0).any()):
+        return False
+    return not _positive(others(step.x0))
 
 
-def linearise(g: Constraint, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
+def _positive(rows: Rows) -> bool:
+    """Whether one of them is, or is no number."""
+    return rows.numel() > 0 and not float(rows.amax()) <= 0
+
+
+def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
     """g(x), its pull w -> w^T dg/dx and row sizes |dg/dx|^2, of g itself or of its smooth positive part g / (1 + e^-g)."""
     rows, pull, size = g.linearise(x)
     if positive == "none":

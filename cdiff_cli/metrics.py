@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import LinearDynamics
+from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -114,9 +115,10 @@ def plan_metrics(task: Task, g: Constraint, x: Array, x_free: Array, paper_units
         "safe_segments": ((worst_waypoint(g, x) <= SAFE) & (worst_segment(g, x) <= SAFE)).astype(np.float64),
         "distance": distance(x, x_free, at),
         "violation_paper": violation(g, x) * paper_units.violation,
-        "distance_paper": distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power),
         "jump": jump(x, at),
     }
+    if len(x) > 1:  # a single plan is its own mean
+        columns["distance_paper"] = distance(x, x_free.mean(0, keepdims=True), at, paper_units.distance_power)
     if task.velocities:
         rate = [task.layout.index(name) for name in task.velocities]
         columns |= {
@@ -227,10 +229,10 @@ def _steps(x: Array, columns: Sequence[int]) -> Array:
 
 
 def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
-    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, of dynamics those that no step leads to."""
+    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, else those that no step leads to."""
     level = getattr(part, "level", None)
     values = part(torch.from_numpy(x)) if level is None else level(torch.from_numpy(x))
-    if not part.spans:
+    if not part.spans or isinstance(part, Rate):
         values = torch.nn.functional.pad(values, (1, 0), value=-torch.inf)
     elif level is None:
         values = values.amax(1, keepdim=True)

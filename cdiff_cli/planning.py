@@ -18,6 +18,7 @@ from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.observed import require_bound
 from cdiff_cli.projection import ADMM_ROUNDS, project, project_from
+from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -84,6 +85,10 @@ def check_feasible(problem: Problem) -> None:
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
             _check_pin(problem, name, state, columns)
+    for part in problem.g.parts:
+        if isinstance(part, Rate) and problem.start is not None and problem.goal is not None:
+            pins = make_pins(problem, len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu"))
+            part.pull_back(problem.normaliser.centre, problem.normaliser.scale).refuse_pins(pins, MARGIN)
 
 
 def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) -> None:

@@ -5,6 +5,7 @@
 half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one scalar root
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression, or of high order a small QP (chains.py)
+limits on the rate of change between waypoints           ADMM on the differences (rates.py), convex
 linear dynamics with bounded inputs, and any of these    active set (reaching.py), ADMM for what has no rows; a local solution
 several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
@@ -27,12 +28,14 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
+from cdiff_cli.rates import Rate, Slowed
 from cdiff_cli.reaching import Warm, nearest_reachable
-from cdiff_cli.segments import goes_round, nearest_in_planes, planes
+from cdiff_cli.segments import crossed, goes_round, nearest_around
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+FINER = 30  # what ADMM asks of a projection within it, over its own tolerance
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
@@ -73,11 +76,11 @@ def _reach(
     used = _coordinates(others, z.shape[-1])
     narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
-    rest = Constraint(tuple(other for other in narrow if not tangible(other)))
+    rest = [other for other in narrow if not tangible(other)]
     x, warm = nearest_reachable(
         part.dynamics,
         around,
-        (lambda p, held: _project(rest, p, held, False)) if rest.parts else None,
+        _rest(rest, tolerance),
         part.decode(z),
         Pins(pins.mask, part.decode(pins.values.to(z))),
         used=used,
@@ -90,6 +93,19 @@ def _reach(
     return pins.paint(part.encode(x).to(kind)), warm
 
 
+def _rest(parts: Sequence[Part], tolerance: float) -> Callable[[Traj, Pins], Traj] | None:
+    """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
+    if len(parts) == 1 and isinstance(parts[0], Rate):
+        slowed = Slowed(parts[0], Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
+
+        def slow(p: Traj, held: Pins) -> Traj:
+            slowed.pins = held
+            return slowed(p)
+
+        return slow
+    return (lambda p, held: _project(Constraint(tuple(parts)), p, held, False)) if parts else None
+
+
 def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
     """The coordinates that the parts constrain."""
     found = torch.zeros(dim, dtype=torch.bool)
@@ -99,6 +115,8 @@ def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
             found |= (level.a != 0).view(-1, dim).any(0).cpu()
         elif isinstance(level, Ellipsoid):
             found |= (level.which != 0).view(-1, dim).any(0).cpu()
+        elif isinstance(part, Rate):
+            found |= (part.which != 0).any(0).cpu()
         else:
             found[:] = True
     return found.nonzero()[:, 0].tolist()
@@ -106,6 +124,8 @@ def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
 
 def _restricted(part: Part, used: Sequence[int]) -> Part:
     """The same part of those coordinates alone."""
+    if isinstance(part, Rate):
+        return replace(part, **{name: getattr(part, name)[..., used] for name in part.trailing})
     numbers: dict[str, Any] = {}
     for name in ("level", "ahead"):
         level = getattr(part, name, None)
@@ -126,20 +146,36 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     sliding = any(isinstance(part, Segments) for part in g.parts)
     around = cast(Any, [part for part in g.parts if sliding and tangible(part)])
     others = [part for part in g.parts if not (sliding and tangible(part))]
+    if not around and len(others) > 1 and pins.whole and (x := _onto_one(g, z, pins, tolerance)) is not None:
+        return x
     begin = z
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
-        onto += [partial(exact, part, pins=pins) for part in others]
+        onto += [Slowed(part, pins) if isinstance(part, Rate) else partial(exact, part, pins=pins) for part in others]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
             return x  # one exact form misses only what is pinned behind what it moves
         if around and others and bool((_free_rows(g, x, pins) > 100 * tolerance).any()):
             x = _dykstra(g, onto, z, pins, tolerance, corrected=False)  # a feasible point, near if not the nearest
-        missed = bool((_free_rows(g, x, pins) > 100 * tolerance).any())  # pinned ends can contradict a chain between them
-        if not missed or (around and not strict):
+        if around and not strict:
+            return x
+        if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
+
+
+def _onto_one(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> Traj | None:
+    """z where it obeys all parts, or its projection onto the only part that it does not obey, where that obeys the others too: the
+    nearest point of a larger set that lies in the smaller one is the nearest of that. None where more have to be heard.
+    """
+    if not bool((g(z) > 0).any()):
+        return z
+    broken = [part for part in g.parts if bool((part(z) > 0).any())]
+    if len(broken) > 1 or not has_exact_form(broken[0]):
+        return None
+    x = exact(broken[0], z, pins)
+    return x if bool((_free_rows(g, x, pins) <= tolerance).all()) else None
 
 
 def tangible(part: Part) -> bool:
@@ -148,24 +184,21 @@ def tangible(part: Part) -> bool:
 
 
 def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins) -> Traj:
-    """Projection onto the half-spaces of tangent planes, chosen anew at each result: the set so described holds the last result,
-    so the distance to z can only fall.
-    """
-    touched = (Constraint(tuple(parts))(z) > 0).any(1)
-    if not bool(touched.any()):
+    """Projection onto the half-spaces of tangent planes, chosen anew at each result; plans that obey already are left alone."""
+    touched = crossed(parts, z).nonzero()[:, 0]
+    if not len(touched):
         return z
-    some, held = z[touched], Pins(pins.mask, pins.values[touched])
-    parts, x = [part.take(touched) for part in parts], some
-    for _ in range(REFINEMENTS):
-        x = nearest_in_planes(some, planes(parts, x, held), held)
-    out = z.clone()
-    out[touched] = x
-    return out
+    every = len(touched) == len(z)
+    if every:
+        return nearest_around(parts, z, pins, REFINEMENTS)
+    return z.index_copy(0, touched, nearest_around([part.take(touched) for part in parts], z[touched], pins, REFINEMENTS))
 
 
 def has_exact_form(part: Part) -> bool:
     if isinstance(part, Waypoints):
         return isinstance(part.level, Affine | Quadric | Framed | Ellipsoid)
+    if isinstance(part, Rate):
+        return True
     if not isinstance(part, Chain):
         return False
     level = part.acting
@@ -176,6 +209,8 @@ def exact(part: Part, z: Traj, pins: Pins) -> Traj:
     """Projection onto one part that has an exact form."""
     if isinstance(part, Waypoints):
         return pins.paint(nearest(part.level, z))
+    if isinstance(part, Rate):
+        return Slowed(part, pins)(z)
     assert isinstance(part, Chain)
     return pins.paint(nearest_on_chain(part, z, pins))
 
@@ -292,7 +327,7 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
     for part in g.parts:
         if isinstance(part, Waypoints):
             each.append(free)
-        elif isinstance(part, Chain | Segments):
+        elif isinstance(part, Chain | Segments | Rate):
             order = len(part.coefficients) - 1 if isinstance(part, Chain) else 1
             each.append(free.unfold(0, order + 1, 1).any(1) if len(free) > order else free[:0])
         else:
@@ -304,6 +339,9 @@ def _refuse_pinned_violations(g: Constraint, z: Traj, pins: Pins, tolerance: flo
     """A pinned state outside the set can never be repaired: say so before moving anything else."""
     if not bool(pins.mask.any()) or not g.parts or z.numel() == 0:
         return
+    for part in g.parts:
+        if isinstance(part, Rate):
+            part.refuse_pins(pins, tolerance)
     stuck = torch.where(_movable(g, z, pins), 0.0, g(z)) > tolerance
     if bool(stuck.any()):
         row = int(stuck.any(0).nonzero()[0])

@@ -107,6 +107,7 @@ class Preset(Strict):
     temperature factor on all noise
     execute     environment steps a plan is followed, in control
     warm        in control, share of the diffusion steps done again on the last plan; None: each plan from noise
+    resume      in control, begin each plan from the multipliers that the last one ended with
     margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
     methods     each method's constants by its name
     """
@@ -121,6 +122,7 @@ class Preset(Strict):
     temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
     execute: Positive = 1
     warm: Annotated[float, Field(gt=0, le=1)] | None = None
+    resume: bool = False
     margin: bool = False
     methods: dict[str, dict[str, Any]] = {}
 
@@ -167,6 +169,7 @@ class Card(Strict):
 
     inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
     constraints   hash of the constraints that a conditional planner was trained for; None of the others
+    observed      quantities that it is told, besides
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -191,6 +194,7 @@ class Card(Strict):
     linear: float | None = None
     inverse: dict[str, float] | None = None
     constraints: str | None = None
+    observed: tuple[str, ...] = ()
 
 
 def home() -> Path:

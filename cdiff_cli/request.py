@@ -12,16 +12,18 @@ import torch
 from numpy.typing import NDArray
 
 from cdiff_cli.baselines import Conditional
+from cdiff_cli.calibrations import Chosen, Conditions, choose, read_calibrations
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.conditioning import content_sha256, guided
+from cdiff_cli.conditioning import Seeing, content_sha256, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
-from cdiff_cli.margins import calibrated, tightened
-from cdiff_cli.methods import METHODS, make_method
+from cdiff_cli.margins import tightened
+from cdiff_cli.methods import METHODS, Unconstrained, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
+from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
 from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
 from cdiff_cli.tasks import Task, load_task
@@ -75,21 +77,26 @@ class Resolved:
     kinds: Sequence[Kind]
     constraints_path: Path
     checkpoint: Checkpoint | None
-    margins: dict[str, float]
+    conditions: Conditions
+    margins: Chosen
     conditional: Checkpoint | None = None
-
-    @property
-    def extra_steps(self) -> int:
-        """Frozen steps after the last: those asked for, else the preset's for this method."""
-        asked = self.options.extra_steps
-        return self.preset.extra_steps_for(self.options.method) if asked is None else asked
 
     @property
     def guided(self) -> Denoiser | None:
         """The clean estimate of a conditional planner; None of the other methods."""
+        return None if self.conditional is None else self._guided(self.conditional, None)
+
+    @property
+    def seeing(self) -> Seeing | None:
+        """The same of a planner that is told what it observes; None of the others."""
         planner = self.conditional
-        limit = 1.0 if planner is None or planner.frame is None else RELATIVE_LIMIT
-        return None if planner is None else guided(planner.net, self.settings["weight"], limit)
+        if planner is None or (telling := planner.telling) is None:
+            return None
+        names, device = planner.card.observed, self.problem.device
+        return lambda seen, present: self._guided(planner, telling([seen[name] for name in names], present).to(device))
+
+    def _guided(self, planner: Checkpoint, told: torch.Tensor | None) -> Denoiser:
+        return guided(planner.net, self.settings["weight"], 1.0 if planner.frame is None else RELATIVE_LIMIT, told)
 
     @property
     def calls_a_step(self) -> int:
@@ -132,11 +139,12 @@ class Resolved:
             "options": options | {"settings": list(self.options.settings)},
             "method": {self.options.method: self.settings},
             "kernel": self.kernel,
-            "extra_steps": self.extra_steps,
+            "extra_steps": self.conditions.extra_steps,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
-            "margins": self.margins,
+            "margins": dict(self.margins.margins),
+            "margins_from": self.margins.told(),
             "n_steps": self.problem.schedule.n_steps,
             "horizon": self.problem.horizon,
             **pins,
@@ -151,6 +159,23 @@ class Resolved:
 
     def _pins(self) -> dict[str, Array | None]:
         return {"start": self.problem.start, "goal": self.problem.goal}
+
+    @property
+    def calibration_command(self) -> str:
+        """The command that fits margins to what was asked for."""
+        flags = {"settings": "--set", "steps": "--steps", "env": "--env"}
+        asked, default = asdict(self.options), asdict(Options())
+        words = ["cdiff rollout --calibrate --level 0.99 --episodes 100 --seed 5000", f"--task {self.options.task}"]
+        for name, value in asked.items():
+            if value != default[name] and name not in ("task", "n", "seed", "device", "calibrate"):
+                each = value if isinstance(value, tuple) else (value,)
+                words += [f"{flags.get(name, '--' + name.replace('_', '-'))} {one}" for one in each]
+        return " ".join(words)
+
+    @property
+    def note(self) -> str:
+        """One line where the margins were calibrated on something else than what was asked for, or not at all."""
+        return self.margins.note(self.conditions, str(self.constraints_path), self.calibration_command)
 
 
 def resolve(options: Options) -> Resolved:
@@ -188,7 +213,10 @@ def resolve(options: Options) -> Resolved:
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
-    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable)
+    kinds, g = load_constraints(path, task.name, task.layout, fitted, observable, getattr(task, "dt", None))
+    limited = [part.name for part in g.parts if isinstance(part, Rate)]
+    if limited and recipe.frame == "relative":
+        raise CdiffError(f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out')
     steps = preset.steps if options.steps is None else options.steps
     if steps is not None:
         if not 1 <= steps <= schedule.n_steps:
@@ -203,13 +231,52 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    margins = {part.name: options.margin for part in g.parts} if options.margin is not None else {}
-    if options.margin is None and preset.margin and checkpoint is not None and not options.calibrate:
-        margins = calibrated(checkpoint.path, checkpoint.card.weights_sha256, path.stem)
-    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins), start, goal, device)
+    conditions = _conditions(options, preset, settings, kernel, schedule.n_steps)
+    margins = _margins(options, preset, method, g, checkpoint, path, kinds, conditions)
+    problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins.margins), start, goal, device)
     check_feasible(problem)
     conditioned = _conditional(kinds, path, checkpoint) if isinstance(method, Conditional) else None
-    return Resolved(options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, margins, conditioned)
+    return Resolved(
+        options, recipe, preset, kernel, method, settings, problem, kinds, path, checkpoint, conditions, margins, conditioned
+    )
+
+
+def _conditions(options: Options, preset: Preset, settings: dict[str, Any], kernel: str, steps: int) -> Conditions:
+    """How plans are made and followed, the options first, else the preset."""
+    extra = options.extra_steps
+    return Conditions(
+        method=options.method,
+        preset=options.preset,
+        settings=settings,
+        kernel=kernel,
+        steps=steps,
+        extra_steps=preset.extra_steps_for(options.method) if extra is None else extra,
+        temperature=preset.temperature,
+        polish=preset.polish,
+        execute=preset.execute if options.execute is None else options.execute,
+        warm=preset.warm if options.warm is None else options.warm,
+        action_noise=options.action_noise,
+        env=tuple(sorted(options.env)),
+    )
+
+
+def _margins(
+    options: Options,
+    preset: Preset,
+    method: Method,
+    g: Constraint,
+    checkpoint: Checkpoint | None,
+    path: Path,
+    kinds: Sequence[Kind],
+    conditions: Conditions,
+) -> Chosen:
+    """The margins asked for, else those calibrated on the nearest conditions."""
+    if options.margin is not None:
+        return Chosen({part.name: options.margin for part in g.parts}, "given")
+    if not preset.margin or checkpoint is None or options.calibrate or isinstance(method, Unconstrained | Conditional):
+        return Chosen({}, "unused")
+    known = read_calibrations(checkpoint.path)
+    return choose(known, checkpoint.card.weights_sha256, path.stem, content_sha256(kinds), conditions)
 
 
 def _require_applicable(options: Options, acts: bool) -> None:
@@ -254,7 +321,9 @@ def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, ch
     if preset.dynamics and dynamics is not None and not dynamics_of(g):
         parts = (*parts, Reachable.of("dynamics", dynamics, DYNAMICS_TOLERANCE))
     weight = torch.tensor([VELOCITY_WEIGHT if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
-    return Constraint(tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts))
+    parts = tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts)
+    unchanged = len(parts) == len(g.parts) and all(part is declared for part, declared in zip(parts, g.parts, strict=True))
+    return g if unchanged else Constraint(parts)
 
 
 def needed_speed(resolved: Resolved) -> tuple[float, float] | None:
@@ -303,6 +372,13 @@ def parse_state(flag: str, text: str | None, default: dict[str, float] | None, t
     return state
 
 
+def fastest(task: Any, g: Constraint) -> float:
+    """The speed that limits on the change of the positions allow, m/s."""
+    at = {task.layout.index(name) for name in task.positions}
+    own = [part.high for part in g.parts if isinstance(part, Rate) and part.norm and set(part.which.argmax(1).tolist()) == at]
+    return min(own, default=math.inf)
+
+
 def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
     """n random feasible starts and goals [n, dim], at rest: both allowed by the constraints, and the shortest way between
     them no faster over one horizon than 95 % of the data's windows.
@@ -314,6 +390,8 @@ def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tup
         speed = task.path_length(*pair[:, :2]) / ((card.horizon - 1) * task.dt)
         x = torch.from_numpy(pair)
         levels = [level for part in g.parts if (level := getattr(part, "level", None)) is not None]
+        if speed > fastest(task, g):
+            continue
         if speed <= card.data["speed_q95"] and all(bool((level(x) <= 0).all()) for level in levels):
             starts.append(pair[0])
             goals.append(pair[1])

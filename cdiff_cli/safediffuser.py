@@ -23,6 +23,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Segments, Traj, Waypoi
 from cdiff_cli.diffusion import Step
 from cdiff_cli.dynamics import split
 from cdiff_cli.errors import InfeasibleError
+from cdiff_cli.rates import Rate
 
 Variant = Literal["ros", "res", "tvs"]
 Solver = Literal["closed-form", "proxqp"]
@@ -102,7 +103,7 @@ def jacobian(part: Part, x: Traj) -> Tensor:
     """dg/dx [batch, n, horizon, dim]: rows that share no waypoint are pulled back together."""
     values, pull, _ = part.linearise(x)
     n, horizon = values.shape[1], x.shape[1]
-    reaches = {Waypoints: 1, Segments: 2, Chain: len(part.coefficients) if isinstance(part, Chain) else 0}
+    reaches = {Waypoints: 1, Segments: 2, Rate: 2, Chain: len(part.coefficients) if isinstance(part, Chain) else 0}
     reach = reaches.get(type(part))
     out = x.new_zeros(len(x), n, horizon, x.shape[2])
     if reach is None:

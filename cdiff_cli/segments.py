@@ -7,13 +7,16 @@ the normals turning evenly from where it enters to where it leaves: a push strai
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeGuard
 
 import torch
 from torch import Tensor
 
-from cdiff_cli.constraint import Constraint, Part, Pins, Segments, Traj, Waypoints
-from cdiff_cli.levels import Affine, Ellipsoid, dot, each_end
+from cdiff_cli.constraint import Constraint, Part, Pins, Pull, Rows, Segments, Traj, Waypoints
+from cdiff_cli.levels import Affine, Ellipsoid, each_end, times
+from cdiff_cli.tangents import ROUNDING, ahead, nearest_points, normals_of, outwards
 
 Planes = tuple[Tensor, Tensor]
 """Half-spaces a.x <= b of each waypoint: a [batch, horizon, m, dim], b [batch, horizon, m]."""
@@ -25,21 +28,40 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     """Half-spaces of each waypoint that together imply the parts: the affine ones themselves, for each ball the tangent planes of
     the segment before and after.
     """
-    each: list[tuple[Tensor, Tensor]] = []
+    m = sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
+    batch, horizon, dim = x.shape
+    a, b = x.new_zeros(dim, m, batch, horizon), x.new_full((m, batch, horizon), NEVER)  # sums over few numbers are fast this way
+    rows, at = a.permute(1, 2, 3, 0), 0
+    n = iter(_each_normals([part.level for part in parts if isinstance(part.level, Ellipsoid)], x, pins))
     for part in parts:
         level = part.level
         if isinstance(level, Affine):
-            each.append((level.a.expand_as(x), level.b.expand(x.shape[:2])))
+            rows[at], b[at] = level.a, level.b
+            at += 1
             continue
         assert isinstance(level, Ellipsoid)
-        n = normals(level, x, pins)
-        zero, never = torch.zeros_like(x[:, :1]), torch.full_like(x[:, :1, 0], NEVER)
-        first, last = zip(each_end(level.centre, 1), each_end(level.axes, 1), strict=True)
-        a, b = _tangent(n, level, *last)  # of the segment before
-        each.append((torch.cat((zero, a), 1), torch.cat((never, b), 1)))
-        a, b = _tangent(n, level, *first)  # of the segment after
-        each.append((torch.cat((a, zero), 1), torch.cat((b, never), 1)))
-    return torch.stack([a for a, _ in each], 2), torch.stack([b for _, b in each], 2)
+        normal = next(n)
+        first, last = zip(each_end(level.which, 2), each_end(level.centre, 1), each_end(level.axes, 1), strict=True)
+        before = _tangent(normal, *last)
+        after = before if all(v is w for v, w in zip(first, last, strict=True)) else _tangent(normal, *first)
+        rows[at, :, 1:], b[at, :, 1:] = before  # of the segment before the waypoint
+        rows[at + 1, :, :-1], b[at + 1, :, :-1] = after
+        at += 2
+    return a.permute(2, 3, 1, 0), b.permute(1, 2, 0)
+
+
+def crossed(parts: Sequence[Waypoints | Segments], x: Traj) -> Tensor:
+    """Which trajectories violate one of the parts, those that planes() takes [batch]."""
+    found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    for part in parts:
+        level = part.level
+        if isinstance(level, Affine):
+            found |= (level(x) > 0).any(1)
+        else:
+            assert isinstance(level, Ellipsoid)
+            y = ahead(level.scaled(x))
+            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1).any(1)
+    return found
 
 
 def goes_round(part: Part) -> TypeGuard[Segments]:
@@ -47,161 +69,200 @@ def goes_round(part: Part) -> TypeGuard[Segments]:
     return isinstance(part, Segments) and isinstance(part.level, Ellipsoid) and part.level.side > 0
 
 
-def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint:
-    """g with each part that goes round a ball replaced by two: the half-spaces of its tangent planes at x, of the segment before
-    each waypoint and of the segment after. One row a waypoint, in the part's own units; -1 where there is no such segment.
+@dataclass(frozen=True)
+class Turned:
+    """A constraint in which half-spaces of tangent planes stand for the parts that go round balls: the rows of the other parts,
+    then of each waypoint those of the segments before and after it, in the parts' own units; -1 where there is no such segment.
+
+    rest   the other parts
+    a, b   [batch, horizon, m, dim], [batch, horizon, m]
     """
-    parts: list[Part] = []
-    for part in g.parts:
-        if not goes_round(part):
-            parts.append(part)
-            continue
-        a, b = planes((part,), x, pins)
+
+    rest: Constraint
+    a: Tensor
+    b: Tensor
+
+    def __call__(self, x: Traj) -> Rows:
+        return self.linearise(x)[0]
+
+    def _values(self, x: Traj) -> Rows:
+        return ((self.a * x[:, :, None]).sum(-1) - self.b).flatten(1)
+
+    def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
+        """As Constraint.linearise."""
+        parts, m = len(self.rest.parts), self.a.shape[2]
+        size = (parts + m) * self.a.square().sum(-1).flatten(1)
+        if not parts:
+            return self._values(x), self._pull, size
+        rows, rest_pull, rest_size = self.rest.linearise(x)
+        n = rows.shape[1]
+        every = torch.cat((rest_size * ((parts + m) / parts), size), 1)
+        return torch.cat((rows, self._values(x)), 1), lambda w: rest_pull(w[:, :n]) + self._pull(w[:, n:]), every
+
+    def _pull(self, w: Rows) -> Traj:
+        return (w.reshape(self.b.shape)[..., None] * self.a).sum(2)
+
+
+def apart(g: Constraint) -> tuple[list[Segments], Constraint]:
+    """The parts of g that go round a ball, and the others."""
+    round_ = [part for part in g.parts if goes_round(part)]
+    return round_, Constraint(tuple(part for part in g.parts if not goes_round(part))) if round_ else g
+
+
+def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint | Turned:
+    """g with half-spaces of tangent planes at x in the place of each part that goes round a ball."""
+    round_, rest = apart(g)
+    if not round_:
+        return g
+    a, b = planes(round_, x, pins)
+    for k, part in enumerate(round_):
         assert isinstance(part.level, Ellipsoid)
-        m = part.level.m.expand(x.shape[:2])
-        for slot in range(a.shape[2]):
-            bound = torch.where(b[..., slot] == NEVER, 1.0, m * b[..., slot])
-            parts.append(Waypoints(part.name, Affine(m[..., None] * a[..., slot, :], bound)))
-    return Constraint(tuple(parts))
+        own, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[..., None]
+        a[:, :, own] *= m[..., None]
+        b[:, :, own] = torch.where(b[:, :, own] == NEVER, 1.0, m * b[:, :, own])
+    return Turned(rest, a, b)
 
 
-def _tangent(n: Tensor, level: Ellipsoid, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+def _tangent(n: Tensor, which: Tensor, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
     """The half-spaces n.y >= 1 as a.x <= b, y the level's scaled x."""
     slope = n / axes
-    return -slope @ level.which, -1 - dot(slope, centre)
+    return -times(slope, which), -1 - (slope * centre).sum(-1)
 
 
 def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
-    """Outward unit normals n of the tangent planes, one a segment, in the coordinates where the surface is the unit sphere
-    [batch, horizon - 1, k]: both ends y of the segment are to satisfy n.y >= 1.
-
-    Outside, n points to the segment's nearest point. Along a run of segments inside, from waypoint a to waypoint b, n turns
-    from the direction of a by way of that of the run's nearest point to that of b, in proportion to the path walked.
-    On a line there is no way round: all normals point to the side that is nearer as a whole.
+    """Normals of the tangent planes, one a segment, in the coordinates where the surface is the unit sphere (tangents.py)
+    [batch, horizon - 1, k].
     """
-    y = level.scaled(x)
-    pinned = pins.mask[:, level.which.argmax(1)].all(1)
-    if y.shape[-1] == 1:
-        return _one_side(y, pinned)
-    first, last = y[:, :-1], y[:, 1:]
-    near = first + level.worst(x)[..., None] * (last - first)
-    distance = near.norm(dim=-1)
-    n = _unit(near, first)
-    inside = distance < 1 - (1e-9 if x.dtype == torch.float64 else 1e-4)  # well above the rounding of a safe path
-    if bool(inside.any()):
-        n = n.clone()
-        n[inside] = _turning(y, near, distance, inside)
-    return _tangent_to_pins(n, y, pinned)
+    return _each_normals([level], x, pins)[0]
+
+
+def _each_normals(levels: Sequence[Ellipsoid], x: Traj, pins: Pins) -> Sequence[Tensor]:
+    """The normals of several levels, all at once where they have as many coordinates."""
+    scaled = [level.scaled(x) for level in levels]
+    held = [pins.held if pins.whole else pins.mask[:, level.which.argmax(-1)].all(1) for level in levels]
+    alike = len({y.shape[-1] for y in scaled}) == 1 and all(h is held[0] or torch.equal(h, held[0]) for h in held[1:])
+    if not alike or len(levels) == 1:
+        return [normals_of(ahead(y), pinned) for y, pinned in zip(scaled, held, strict=True)]
+    return normals_of(ahead(torch.cat(scaled)), held[0]).chunk(len(levels))
 
 
 def nearest_in_planes(z: Traj, halfspaces: Planes, pins: Pins) -> Traj:
     """The nearest trajectory with a.x <= b at every waypoint, pinned waypoints left alone: exact with up to two active rows a
     waypoint (always enough in the plane); where more are needed, the best point that two give.
     """
+    return _moved(z, halfspaces, pins)[0]
+
+
+def _moved(z: Traj, halfspaces: Planes, pins: Pins) -> tuple[Traj, Tensor]:
+    """nearest_in_planes() and the waypoints that it moved, counted on over the batch [n]."""
     a, b = halfspaces
     value = (a * z[:, :, None]).sum(-1) - b
-    wrong = (value.amax(2) > 0) & ~pins.mask.any(1)
-    if not bool(wrong.any()):
-        return z
-    out = z.clone()
-    out[wrong] = z[wrong] + _step(a[wrong].double(), value[wrong].double()).to(z)
-    return out
+    wrong = (value.amax(2) > 0) & ~pins.held
+    at = wrong.flatten().nonzero()[:, 0]
+    if not len(at):
+        return z, at
+    m, dim = a.shape[2:]
+    rows = a.permute(3, 2, 0, 1).reshape(dim, m, -1).index_select(2, at).double()
+    step = _step(rows, value.permute(2, 0, 1).reshape(m, -1).index_select(1, at).double())
+    return z.flatten(0, 1).index_add(0, at, step.T.to(z)).view(z.shape), at
+
+
+def nearest_around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins, rounds: int) -> Traj:
+    """The nearest trajectory in the half-spaces of tangent planes, chosen at z and then anew at each result: the set so described
+    holds the last result, so the distance to z can only fall. What the first choice leaves where it is the others do too.
+    """
+    x, at = _moved(z, planes(parts, z, pins), pins)
+    if not len(at):
+        return x
+    horizon = z.shape[1]
+    tau = at % horizon
+    back, on = tau > 0, tau < horizon - 1
+    beside = torch.stack((at - back.long(), at, at + on.long()))
+    missing = None if pins.loose[0] > 0 and pins.loose[1] < horizon else torch.stack((~back, ~on))
+    pinned = pins.mask[beside[::2] % horizon]  # of the waypoints before and after [2, n, dim]
+    held = pinned if bool(pinned.any()) else None
+    from_ = z.flatten(0, 1).index_select(0, at).T
+    for _ in range(rounds - 1):
+        rows = _planes_beside(parts, x, beside, missing, held)
+        if rows is None:  # a step of two rows left some segment inside
+            x = _moved(z, planes(parts, x, pins), pins)[0]
+            continue
+        a, b = rows
+        value = (a * from_[:, None]).sum(0) - b
+        wrong = value.amax(0) > 0
+        step = torch.where(wrong, _step(a.double(), value.double()), 0.0)
+        x = x.flatten(0, 1).index_copy(0, at, (from_ + step.to(z)).T).view(z.shape)
+    return x
+
+
+def _planes_beside(
+    parts: Sequence[Waypoints | Segments], x: Traj, beside: Tensor, missing: Tensor | None, held: Tensor | None
+) -> tuple[Tensor, Tensor] | None:
+    """planes() of some free waypoints alone, a [dim, m, n], b [m, n]; None where a segment beside them is inside a ball.
+
+    beside    indices of the waypoints before, themselves, and after, counted on over the batch   [3, n]
+    missing   whether there is no segment before, no segment after   [2, n]
+    held      pinned coordinates of the waypoints before and after, None where there are none   [2, n, dim]
+    """
+    n, dim, slots = beside.shape[1], x.shape[2], []
+
+    def own(value: Tensor, trailing: int) -> Tensor:
+        """A number of a level at each waypoint [n, ...]."""
+        if value.ndim == trailing:
+            return value
+        each = value.expand(*x.shape[:2], *value.shape[value.ndim - trailing :])
+        return each.flatten(0, 1)[beside[1]]
+
+    for part in parts:
+        level = part.level
+        if isinstance(level, Affine):
+            slots.append((own(level.a, 1).expand(n, dim).T[:, None], own(level.b, 0).expand(1, n)))
+            continue
+        assert isinstance(level, Ellipsoid)
+        y = ahead(level.scaled(x).flatten(0, 1).index_select(0, beside.flatten()).view(3, n, -1))
+        near, distance, _ = nearest_points(y[:2], y[1:])
+        if y.shape[-1] == 1 or bool((distance < 1 - ROUNDING[x.dtype]).any()):
+            return None
+        normal = near / distance[..., None]
+        if held is not None:
+            normal = outwards(normal, y[::2], held[..., level.which.argmax(-1)].all(-1, keepdim=True))
+        a, b = _tangent(normal, level.which, own(level.centre, 1), own(level.axes, 1))
+        slots.append((a.movedim(-1, 0), b if missing is None else torch.where(missing, NEVER, b)))
+    return torch.cat([a for a, _ in slots], 1), torch.cat([b for _, b in slots])
+
+
+@lru_cache(maxsize=16)
+def _pairs(m: int, device: torch.device) -> Tensor:
+    """The first and the second of every two rows, or the only row twice [2, pairs]."""
+    return torch.triu_indices(m, m, 1 if m > 1 else 0, device=device)
 
 
 def _step(a: Tensor, value: Tensor) -> Tensor:
-    """The shortest d with value + a.d <= 0, among those that make one row or two rows equal: [n, m, dim] -> [n, dim]."""
-    m, size = a.shape[1], a.square().sum(-1)
-    i, j = torch.triu_indices(m, m, device=a.device)
-    gram = torch.einsum("nid,njd->nij", a, a)[:, i, j]
-    same = i == j
-    det = torch.where(same, size[:, i], size[:, i] * size[:, j] - gram**2)
-    floor = 1e-9 * (size[:, i] * size[:, j]).clamp_min(1e-30)
-    usable = torch.where(same, size[:, i] > 0, det > floor)
-    det = torch.where(usable, det, 1.0)
-    mu_i = torch.where(same, value[:, i], size[:, j] * value[:, i] - gram * value[:, j]) / det
-    mu_j = torch.where(same, 0.0, (size[:, i] * value[:, j] - gram * value[:, i]) / det)
-    d = -(mu_i[..., None] * a[:, i] + mu_j[..., None] * a[:, j])  # [n, pairs, dim]
-    excess = (value[:, None] + torch.einsum("npd,nid->npi", d, a)).clamp_min(0)
-    missed = torch.where(usable, excess.amax(-1), torch.inf)
-    cost = torch.where(missed <= 1e-9, d.square().sum(-1), 1e12 * (1 + missed))
-    return d[torch.arange(len(d), device=d.device), cost.argmin(1)]
+    """The shortest d with value + a.d <= 0, among those that make one row or two rows equal: a [dim, m, n], value [m, n]
+    -> [dim, n].
 
-
-def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
-    """The normal of the whole path on a line: towards its pinned ends, else where it takes the shorter way [batch, n, 1]."""
-    below, above = ((1 + side * y).clamp_min(0).square().sum(1, keepdim=True) for side in (1, -1))
-    held = y[:, pinned].sum(1, keepdim=True)
-    up = torch.where(held == 0, above <= below, held > 0)
-    return (2 * up.to(y) - 1).expand(-1, y.shape[1] - 1, -1)
-
-
-def _turning(y: Tensor, near: Tensor, distance: Tensor, inside: Tensor) -> Tensor:
-    """Normals of the segments inside the sphere, along their runs, as normals() describes [segments inside, k]."""
-    n = inside.shape[1]
-    index = torch.arange(n, device=y.device).expand_as(inside)
-    start = torch.where(inside, -1, index).cummax(1).values + 1  # first segment of the run
-    stop = torch.where(inside, n, index).flip(1).cummin(1).values.flip(1) - 1  # its last
-    run = start.clamp_max(n - 1)
-    deepest = torch.full_like(distance, torch.inf).scatter_reduce(1, run, torch.where(inside, distance, torch.inf), "amin")
-    is_deepest = inside & (distance <= deepest.gather(1, run))
-    middle = torch.full_like(index, n).scatter_reduce(1, run, torch.where(is_deepest, index, n), "amin").gather(1, run)
-
-    b, i = inside.nonzero(as_tuple=True)
-    run, stop, middle = run[b, i], stop[b, i], middle[b, i]
-    into, out, nearest = y[b, run], y[b, stop + 1], near[b, middle]
-    across = out - into
-    along = _unit(across, into)
-    e_in, e_out = _unit(into, across), _unit(out, across)
-    aside = nearest - (nearest * along).sum(-1, keepdim=True) * along
-    e_mid = _unit(nearest, _sideways(aside, across))
-    walked = torch.cat((torch.zeros_like(distance[:, :1]), (y[:, 1:] - y[:, :-1]).norm(dim=-1).cumsum(1)), 1)
-    half = (walked[b, i] + walked[b, i + 1]) / 2  # at the middle of each segment
-    begin, end = walked[b, run], walked[b, stop + 1]
-    share = torch.where(end > begin, (half - begin) / (end - begin).clamp_min(1e-12), 0.5)[..., None]
-    to_mid, to_out = _angle(e_in, e_mid), _angle(e_mid, e_out)
-    angle = share * (to_mid + to_out)
-    return torch.where(angle <= to_mid, _turn(e_in, e_mid, angle), _turn(e_mid, e_out, angle - to_mid))
-
-
-def _turn(e: Tensor, towards: Tensor, angle: Tensor) -> Tensor:
-    """The unit vector at that angle from e on the great circle towards another."""
-    aside = towards - (towards * e).sum(-1, keepdim=True) * e
-    return angle.cos() * e + angle.sin() * _unit(aside, _sideways(torch.zeros_like(e), e))
-
-
-def _angle(a: Tensor, b: Tensor) -> Tensor:
-    return 2 * torch.atan2((a - b).norm(dim=-1, keepdim=True), (a + b).norm(dim=-1, keepdim=True))
-
-
-def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
-    """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
-    for ends, held in ((y[:, :-1], pinned[:-1]), (y[:, 1:], pinned[1:])):
-        some = held.nonzero()[:, 0]  # a few of many segments
-        at, normal = ends[:, some], n[:, some]
-        length = at.norm(dim=-1, keepdim=True)
-        e = at / length.clamp_min(1e-12)
-        beyond = ((normal * at).sum(-1, keepdim=True) < 1) & (length >= 1)
-        cosine = 1 / length.clamp_min(1.0)
-        aside = _unit(normal - (normal * e).sum(-1, keepdim=True) * e, _sideways(torch.zeros_like(e), e))
-        turned_to = cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * aside
-        n = n.index_copy(1, some, torch.where(beyond, turned_to, normal))
-    return n
-
-
-def _unit(v: Tensor, instead: Tensor) -> Tensor:
-    """v / |v|, or the direction of another vector where v is nearly zero."""
-    length, other = v.norm(dim=-1, keepdim=True), instead.norm(dim=-1, keepdim=True)
-    first = torch.zeros_like(v)
-    first[..., 0] = 1.0
-    spare = torch.where(other > 1e-9, instead / other.clamp_min(1e-9), first)
-    return torch.where(length > 1e-9, v / length.clamp_min(1e-9), spare)
-
-
-def _sideways(v: Tensor, along: Tensor) -> Tensor:
-    """v, or where it is nearly zero some vector at right angles to `along`."""
-    turned = torch.zeros_like(along)
-    turned[..., 0], turned[..., 1] = -along[..., 1], along[..., 0]
-    flat = turned.norm(dim=-1, keepdim=True) < 1e-9  # along has neither: any first axis will do
-    first = torch.zeros_like(along)
-    first[..., 0] = 1.0
-    return torch.where(v.norm(dim=-1, keepdim=True) > 1e-9, v, torch.where(flat, first, turned))
+    Of two unit rows with cosine c the multipliers are mu = (v - c v_other) / (1 - c^2), where neither is negative; a row whose
+    other one has no multiplier stands alone, mu = [v]_+.
+    """
+    size = a.square().sum(0).sqrt_().clamp_min_(1e-15)
+    a, value = a / size, value / size
+    if a.shape[1] == 2:
+        two, v = a[:, :, None], value[:, None]
+    else:
+        pairs = _pairs(a.shape[1], a.device)
+        two, v = a[:, pairs], value[pairs]  # [dim, 2, pairs, n], [2, pairs, n]
+    cosine = (two[:, 0] * two[:, 1]).sum(0)
+    det = 1 - cosine.square()
+    parallel = det < 1e-9
+    mu = v - cosine * v.flip(0)
+    if bool(parallel.any()):
+        larger = v[0] >= v[1]
+        mu = torch.where(parallel, torch.stack((larger, ~larger)).to(mu) - 0.5, mu)
+        det = torch.where(parallel, 1.0, det)
+    mu = torch.where(mu.flip(0) > 0, (mu / det).clamp_min_(0), v.clamp_min(0))
+    d = -(mu * two).sum(1)  # [dim, pairs, n]
+    if d.shape[1] == 1:
+        return d[:, 0]
+    missed = ((d[:, :, None] * a[:, None]).sum(0) + value).amax(1)  # [pairs, n]
+    cost = torch.where(missed <= 1e-9, d.square().sum(0), 1e12 * (1 + missed))
+    return d.gather(1, cost.argmin(0).expand(len(d), 1, -1))[:, 0]

@@ -18,6 +18,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part
 from cdiff_cli.dynamics import LinearDynamics, Reachable
 from cdiff_cli.errors import suggestion
 from cdiff_cli.levels import Affine, Ellipsoid, Level
+from cdiff_cli.rates import Rate, limits
 from cdiff_cli.spec_levels import (
     Coordinates,
     Hold,
@@ -202,6 +203,59 @@ class Dynamics(Strict):
         return f"each step obeys x' = A x + B u + c, {bounds}"
 
 
+class RateLimit(Strict):
+    """How fast coordinates may change from a waypoint to the next, in their units a second; the same all along the segment.
+
+    of: [x, y]   a list: the length of their change together, a second, is at most `max`
+    of: vx       one name: its change a second, with its sign, lies within `min` and `max`, of which one may be left out
+    """
+
+    kind: Literal["rate"]
+    name: str = ""
+    of: Annotated[
+        str | Annotated[list[str], Field(min_length=1)],
+        Field(description="a list: the length of the change; a name: its signed change"),
+    ]
+    min: Annotated[Number | None, Field(description="of a single coordinate, units a second")] = None
+    max: Annotated[Number | None, Field(description="units a second")] = None
+    dt: Annotated[PositiveNumber | None, Field(description="seconds between waypoints; filled in: it is the task's")] = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "RateLimit":
+        if isinstance(self.of, str):
+            if self.min is None and self.max is None:
+                raise ValueError("expected `min`, `max` or both: without them the rate is not limited")
+            if self.min is not None and self.max is not None and not self.min < self.max:
+                raise ValueError(f"min, {self.min:g}, is not below max, {self.max:g}")
+        elif len(set(self.of)) < len(self.of):
+            raise ValueError("`of` names a coordinate twice")
+        elif self.max is None or self.max <= 0 or self.min is not None:
+            raise ValueError(
+                "a list limits the length of the change: expected `max` above 0 and no `min`; name one coordinate for those"
+            )
+        return self
+
+    def coordinates(self) -> Iterator[tuple[Location, str]]:
+        if isinstance(self.of, str):
+            yield ("of",), self.of
+        else:
+            yield from ((("of", i), name) for i, name in enumerate(self.of))
+
+    def compile(self, layout: Layout) -> Part:
+        assert self.dt is not None, "the task's, see load_constraints"
+        names = [self.of] if isinstance(self.of, str) else self.of
+        which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
+        one = torch.ones(len(layout), dtype=torch.float64)
+        low, high = limits(self.min, self.max)
+        return Rate(self.name, which, low, high, not isinstance(self.of, str), self.dt, torch.zeros_like(one), one)
+
+    def describe(self) -> str:
+        if not isinstance(self.of, str):
+            return f"|change of {', '.join(self.of)}| <= {self.max:g} a second between waypoints"
+        low, high = ("" if v is None else f"{v:g}" for v in (self.min, self.max))
+        return f"{low}{' <= ' if low else ''}change of {self.of}{' <= ' if high else ''}{high} a second between waypoints"
+
+
 class Kind(Protocol):
     """What every kind offers, ours and those of other packages."""
 
@@ -215,7 +269,7 @@ class Kind(Protocol):
 
 def kinds() -> tuple[type[Strict], ...]:
     """All kinds: the built-in ones and those of the entry-point group cdiff.constraints."""
-    return (Linear, Quadratic, Dcbf, Dynamics, *(entry.load() for entry in entry_points(group="cdiff.constraints")))
+    return (Linear, Quadratic, Dcbf, Dynamics, RateLimit, *(entry.load() for entry in entry_points(group="cdiff.constraints")))
 
 
 def file_model() -> type[Strict]:
@@ -229,12 +283,18 @@ def file_model() -> type[Strict]:
 
 
 def load_constraints(
-    path: Path, task: str, layout: Layout, dynamics: LinearDynamics | None = None, observable: Sequence[str] = ()
+    path: Path,
+    task: str,
+    layout: Layout,
+    dynamics: LinearDynamics | None = None,
+    observable: Sequence[str] = (),
+    dt: float | None = None,
 ) -> tuple[list[Kind], Constraint]:
     """The kinds of a constraint file and the g(x) <= 0 they compile into, environment units; raises SpecError.
 
     dynamics     what `fit: demonstrations` stands for; None where there are none
     observable   names of the quantities that the task lets constraints observe
+    dt           seconds between its waypoints; None where they have none
     """
     document = Document(path)
     model = cast(Any, document.read(file_model()))
@@ -264,6 +324,14 @@ def load_constraints(
                     "give A, B and inputs instead",
                 )
             named = Dynamics.of(dynamics, layout, named.name, named.tolerance)
+        if isinstance(named, RateLimit):
+            if dt is None:
+                raise document.error(
+                    ("constraints", i, "kind"), f"the waypoints of {task} are not in time; a rate has no meaning there"
+                )
+            if named.dt not in (None, dt):
+                raise document.error(("constraints", i, "dt"), f"the waypoints of {task} are {dt:g} s apart; leave `dt` out")
+            named = named.model_copy(update={"dt": dt})
         parts.append(named)
     return parts, Constraint(tuple(spec.compile(layout) for spec in parts))
 

@@ -23,6 +23,7 @@ from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.methods import METHODS
 from cdiff_cli.recipe import load_recipe
 from cdiff_cli.request import Options, resolve
+from cdiff_cli.runs import Row, find_rows, read_rows
 from cdiff_cli.tasks import load_task
 
 BACKENDS = ("local", "ray", "dask")
@@ -57,18 +58,28 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A job that is over; its error where it failed."""
+    """A job that is over; its error where it failed, and whether its run is kept but its episode diverged."""
 
     job: Job
     seconds: float
     error: str | None = None
+    diverged: bool = False
+
+    @property
+    def trouble(self) -> str | None:
+        """What there is to tell of it, in a line."""
+        if self.error is not None:
+            return f"failed: {self.job.name}: {self.error}"
+        if self.diverged:
+            return f"diverged: {self.job.name}: a plan or a state was no longer finite; what was done until then is kept"
+        return None
 
 
 @dataclass(frozen=True)
 class Plan:
     """The jobs of a matrix: those whose directory is whole, those to do, and those that cannot even begin."""
 
-    done: Sequence[Job]
+    done: Sequence[Outcome]
     todo: Sequence[Job]
     refused: Sequence[Outcome]
 
@@ -76,16 +87,18 @@ class Plan:
 def plan_sweep(matrix: Matrix, root: Path) -> Plan:
     """Sort the matrix by what lies below root; CdiffError where a name in it is unknown."""
     _check_names(matrix)
-    there = {path.name.partition("-")[2].partition("-")[2] for path in root.glob("[!.]*") if (path / "rows.csv").exists()}
-    done: list[Job] = []
+    there = {path.parent.name.partition("-")[2].partition("-")[2]: path for path in find_rows(root)}
+    done: list[Outcome] = []
     todo: list[Job] = []
     refused: list[Outcome] = []
     for task, constraints, preset, method in product(matrix.tasks, matrix.constraints, matrix.presets, matrix.methods):
         for job in _jobs(matrix, task, constraints, preset, method):
             if isinstance(job, Outcome):
                 refused.append(job)
+            elif job.name in there:
+                done.append(Outcome(job, 0.0, diverged=_diverged(read_rows(there[job.name]))))
             else:
-                (done if job.name in there else todo).append(job)
+                todo.append(job)
     return Plan(done, todo, refused)
 
 
@@ -151,12 +164,16 @@ def run_job(job: Job, root: Path, folder: Path) -> Outcome:
             resolved = resolve(job.options)
             execute = control_run if resolved.recipe.frame == "relative" else rollout_run
             make = cast(Any, execute if job.rollout else plan_run)
-            make(resolved, root, lambda *_: None, name=job.name, pictures=False)
-        return Outcome(job, time.perf_counter() - began)
+            finished = make(resolved, root, lambda *_: None, name=job.name, pictures=False)
+        return Outcome(job, time.perf_counter() - began, diverged=_diverged(finished.rows))
     except CdiffError as error:
         return Outcome(job, time.perf_counter() - began, str(error))
     except Exception as error:  # whatever it is, it is told at the end, and the other jobs go on
         return Outcome(job, time.perf_counter() - began, f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def _diverged(rows: Sequence[Row]) -> bool:
+    return any(row.get("diverged") == 1 for row in rows)
 
 
 @contextlib.contextmanager
@@ -210,7 +227,9 @@ def _extra(name: str) -> Iterator[None]:
 def run_sweep(
     matrix: Matrix, root: Path, workers: int, screen: Console, backend: str = "local", address: str | None = None
 ) -> list[Outcome]:
-    """Make the missing runs, tell of them on screen (a table, or a line a run where it is no terminal), return the failed ones."""
+    """Make the missing runs, tell of them on screen (a table, or a line a run where it is no terminal); return those that failed or
+    diverged, which were there included.
+    """
     if workers < 1 or not matrix.seeds:
         raise CdiffError(f"--{'seeds' if workers >= 1 else 'jobs'}: expected at least 1")
     if backend not in BACKENDS:
@@ -227,9 +246,9 @@ def run_sweep(
             if live:
                 live.update(progress_table(over, plan, began), refresh=True)
             else:
-                state = "failed" if outcome.error else "made"
+                state = "failed" if outcome.error else "made, diverged:" if outcome.diverged else "made"
                 screen.print(f"{len(plan.done) + len(over)} of {_size(plan)}: {state} {outcome.job.name}", soft_wrap=True)
-    return [outcome for outcome in over if outcome.error is not None]
+    return [outcome for outcome in (*plan.done, *over) if outcome.trouble]
 
 
 def _size(plan: Plan) -> int:
@@ -237,18 +256,20 @@ def _size(plan: Plan) -> int:
 
 
 def progress_table(over: Sequence[Outcome], plan: Plan, began: float) -> Table:
-    """A line a group: done, failed, of how many, mean seconds a run made; above it what is left."""
+    """A line a group: done, of them diverged, failed, of how many, mean seconds a run made; above it what is left."""
     made, left = len(over) - len(plan.refused), len(plan.todo) + len(plan.refused) - len(over)
     eta = f", about {(time.monotonic() - began) * left / made:.0f} s" if made and left else ""
     table = Table(title=f"{len(plan.done)} were there, {made} made, {left} to do{eta}", title_justify="left")
     for heading in ("task", "constraints", "method", "preset"):
         table.add_column(heading)
-    for heading in ("done", "failed", "of", "s / run"):
+    for heading in ("done", "diverged", "failed", "of", "s / run"):
         table.add_column(heading, justify="right")
-    every = Counter(job.group for job in (*plan.done, *plan.todo, *(outcome.job for outcome in plan.refused)))
-    there, failed = Counter(job.group for job in plan.done), Counter(o.job.group for o in over if o.error is not None)
+    every = Counter(job.group for job in (*plan.todo, *(outcome.job for outcome in (*plan.done, *plan.refused))))
+    there, failed = Counter(o.job.group for o in plan.done), Counter(o.job.group for o in over if o.error is not None)
+    diverged = Counter(outcome.job.group for outcome in (*plan.done, *over) if outcome.diverged)
     for group, total in every.items():
         took = [outcome.seconds for outcome in over if outcome.job.group == group and outcome.error is None]
         mean = f"{sum(took) / len(took):.1f}" if took else ""
-        table.add_row(*group, str(there[group] + len(took)), str(failed[group]), str(total), mean)
+        counts = (there[group] + len(took), diverged[group], failed[group], total)
+        table.add_row(*group, *map(str, counts), mean)
     return table

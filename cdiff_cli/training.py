@@ -7,29 +7,24 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from cdiff_cli.checkpoint import Checkpoint, Network, build, load_checkpoint, read_safetensors, save_checkpoint, write_safetensors
-from cdiff_cli.conditioning import LABELS, Condition, drop
-from cdiff_cli.data import Array, Normaliser, Progress, Windows, demonstrations, digest, load_dataset, load_inputs
+from cdiff_cli.conditioning import Condition
+from cdiff_cli.data import Array, Progress, demonstrations, digest, load_dataset, load_inputs
 from cdiff_cli.diffusion import Schedule, Weighing, training_loss
 from cdiff_cli.dynamics import LinearDynamics, fit
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
-from cdiff_cli.frames import Frame
+from cdiff_cli.examples import Data, Draw
 from cdiff_cli.inverse import fit_inverse
 from cdiff_cli.recipe import Recipe, TrainSpec, home, shown
-from cdiff_cli.tasks import ControlTask, Task
+from cdiff_cli.tasks import Task
 
-SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
 LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
-
-
-Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor | None]]
-"""(how many, generator) -> windows and, of a conditional planner, their labels."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +76,14 @@ def train(
     if size not in recipe.train:
         raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
     spec = recipe.train[size]
-    if spec.network.conditions != (LABELS if condition else 0):
-        wanted = f"conditions: {LABELS} in its network" if condition else "--conditional FILE"
+    if spec.network.conditions != (condition.entries if condition else 0):
+        wanted = f"conditions: {condition.entries} in its network" if condition else "--conditional FILE"
         raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or add it')
     asked = recipe.demonstrations
     episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
     source = dataset or f"cdiff/{task.name}-v0"
     inputs = load_inputs(task, source)  # before the long part: a dataset without them is refused at once
-    data = Data.of(task, recipe, spec, episodes, condition)
+    data = Data.of(task, recipe, spec, episodes, condition, seed)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
@@ -142,6 +137,7 @@ def train(
         "linear": None if dynamics is None else round(dynamics[1], 6),
         "inverse": explained,
         "constraints": condition.sha256 if condition else None,
+        "observed": condition.observed if condition else (),
     }
     tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()} | data.tensors()
     if inverse is not None:
@@ -158,63 +154,6 @@ def fit_dynamics(episodes: Sequence[Array], inputs: Sequence[Array]) -> tuple[Li
     steps = [(x[:-1], u[: len(x) - 1], x[1:]) for x, u in zip(episodes, inputs, strict=True)]
     x, u, after = (np.concatenate(part) for part in zip(*steps, strict=True))
     return fit(x, u, after)
-
-
-def end_pins(horizon: int, dim: int) -> Tensor:
-    """Mask [horizon, dim] of the coordinates given clean in training: the whole first and last state."""
-    pinned = torch.zeros(horizon, dim, dtype=torch.bool)
-    pinned[[0, -1]] = True
-    return pinned
-
-
-@dataclass(frozen=True)
-class Data:
-    """The windows that a network is trained on, in its own coordinates.
-
-    frame    of relative windows; None where the data's limits are the coordinates
-    pinned   coordinates given clean, in training as in sampling   [horizon, dim]
-    """
-
-    windows: Windows
-    normaliser: Normaliser
-    frame: Frame | None
-    pinned: Tensor
-    condition: Condition | None
-    dropout: float
-
-    @classmethod
-    def of(
-        cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array], condition: Condition | None = None
-    ) -> "Data":
-        pinned = end_pins(recipe.horizon, len(task.layout))
-        if recipe.frame == "relative":
-            windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
-            frame = Frame.fit(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
-            pinned[-1] = False
-            return cls(windows, frame.state, frame, pinned, condition, spec.dropout)
-        normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)
-        windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
-        if task.velocities:
-            columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
-            windows = windows.favour_trips(spec.trips, *columns)
-        return cls(windows, normaliser, None, pinned, condition, spec.dropout)
-
-    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
-        """n windows and, of a conditional planner, their labels."""
-        x, label = self.windows.draw(n, generator), None
-        if self.condition is not None:
-            states = x if self.frame is not None else self.normaliser.decode(x.double())
-            label = drop(self.condition.label(states), self.dropout, generator)
-        return x if self.frame is None else self.frame.encode(x), label
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What a checkpoint keeps of them."""
-        sample = self.windows[torch.linspace(0, len(self.windows.starts) - 1, SAMPLES).long()].double()
-        kept = {"normaliser.centre": self.normaliser.centre, "normaliser.scale": self.normaliser.scale}
-        if self.frame is None:
-            return kept | {"demonstrations": self.normaliser.decode(sample).float()}
-        kept |= {f"frame.{name}": getattr(self.frame, name).contiguous() for name in ("seen", "mean", "gain", "scale")}
-        return kept | {"demonstrations": sample.float()}
 
 
 @dataclass

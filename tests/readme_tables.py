@@ -16,6 +16,8 @@ MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "torn", "wall", "calls")
 SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
+BRIEF = ("distance", "violation_paper", "worst_segment", "torn", "wall")
+IN_BRIEF = ("reward", "violation_rate", "executed_violation", "safe_executed", "fell")
 CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
 BALL = ("reward", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "contacts", "braked", "calls")
 QUALITY = ("wall", "smooth", "success", "jump", "residual", "acceleration", "effort", "goal_distance")
@@ -27,13 +29,35 @@ def of_rows(name: str, columns: tuple[str, ...], paper: bool = False) -> str:
     return tables.render(runs.compare(runs.read_rows(REFERENCE / name / "rows.csv")), columns, "markdown", values)
 
 
+def in_short(names: tuple[str, ...], columns: tuple[str, ...], shown: tuple[tuple[str, str], ...], paper: bool = False) -> str:
+    """The same of several, one (method, preset) of `shown` after the other for each constraint file."""
+    values = tables.read_paper(REFERENCE / "paper.csv") if paper else None
+    groups = [group for name in names for group in runs.compare(runs.read_rows(REFERENCE / name / "rows.csv"))]
+    found = {group.key: group for group in groups}
+    asked = [(*files, *pair) for files in dict.fromkeys(group.key[:2] for group in groups) for pair in shown]
+    return tables.render([found[key] for key in asked if key in found], columns, "markdown", values)
+
+
 def of_metrics() -> str:
     """What each column means."""
     lines = [f"| {column.title} | {column.meaning.replace('|', '&#124;')} |" for column in runs.COLUMNS.values()]
     return "\n".join(["| column | definition |", "| --- | --- |", *lines])
 
 
+MAZES = (
+    *(("diffuser", "paper"), ("conditional", "paper"), ("safediffuser", "paper"), ("projected", "paper")),
+    *(("primal-dual", "released"), ("alm", "released"), ("projected", "recommended"), ("alm", "recommended")),
+)
+THREE = (("diffuser", "recommended"), ("projected", "paper"), ("alm", "recommended"))
+ACTING = (
+    *(("diffuser", "recommended"), ("conditional", "paper"), ("projected", "paper")),
+    *(("alm", "released"), ("alm", "recommended")),
+)
+
 TABLES: dict[str, Callable[[], str]] = {
+    "safety-short": lambda: in_short(("safety-umaze", "safety-large"), (*SAFETY[:4], "distance"), THREE),
+    "table1-short": lambda: in_short(("table1-umaze", "table1-large"), BRIEF, MAZES, paper=True),
+    "table2-short": lambda: in_short(("table2-hopper", "table2-swimmer"), IN_BRIEF, ACTING, paper=True),
     "table1-umaze": lambda: of_rows("table1-umaze", PAPER, paper=True),
     "table1-large": lambda: of_rows("table1-large", PAPER, paper=True),
     "safety-umaze": lambda: of_rows("safety-umaze", SAFETY),

@@ -151,7 +151,7 @@ def test_a_base_of_another_network_or_other_data_is_refused(tmp_path):
 
 
 def test_the_shipped_planner_violates_less_than_the_unconditional_one_and_counts_both_calls():
-    """Seeds 0-9, 64 steps: 0.16 of the violation was left; here four plans of 16 steps each."""
+    """Seeds 0-9, 64 steps: 0.004 of the violation was left; here four plans of 16 steps each."""
     resolved = resolve(Options(method="conditional", preset="paper", n=4, steps=16))
     plans, free = _plan_both(resolved, lambda *_: None)
     left, before = (violation(resolved.problem.g, each.x).sum() for each in (plans, free))

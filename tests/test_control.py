@@ -9,14 +9,15 @@ import pytest
 import torch
 
 from cdiff_cli import metrics
+from cdiff_cli.baselines import BestOf
 from cdiff_cli.constraint import Constraint, Waypoints
-from cdiff_cli.control import Controller, control
+from cdiff_cli.control import Controller, _Resumed, control
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import Schedule
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.frames import Frame
 from cdiff_cli.levels import Affine
-from cdiff_cli.methods import Projected, Unconstrained
+from cdiff_cli.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
 from cdiff_cli.networks import InverseDynamics
 from tests.problems import F64, chain, vec
 
@@ -241,3 +242,79 @@ def test_what_a_step_tells_reaches_the_method():
 
     control(replace(FREE, method=Asked()), [0], steps=1)
     assert told == [(2, False), (1, False), (0, True)]
+
+
+def test_what_a_warm_plan_does_not_reach_goes_on_as_the_frame_foresees():
+    """A plan that leaves the frame's mean by 0.3 everywhere, followed for two steps, without noise: its last two waypoints are the
+    mean again, and not where it stood at its end.
+    """
+    seen = []
+
+    def off(x: torch.Tensor, t: int) -> torch.Tensor:
+        seen.append((t, x))
+        return torch.where(torch.arange(H)[:, None] > 0, 0.3, x)
+
+    control(replace(FREE, denoiser=off, warm=0.4, execute=2, temperature=0.0), [0], steps=4)
+    assert [t for t, _ in seen] == [3, 2, 1, 1]
+    began = seen[-1][1][0]
+    assert (began[-2:] == 0).all()
+    assert (began[1:-2].abs() > 0.01).any()
+
+
+class Counting:
+    """Unconstrained; its multipliers, one row of the plan's chain each, count the steps."""
+
+    def init(self, x, g):
+        return torch.zeros(len(x), H - 1)
+
+    def step(self, step, g, state):
+        self.begun = [*getattr(self, "begun", []), state[:, 0].tolist()]
+        return step.reverse(step.x0), state + 1
+
+
+def test_multipliers_go_on_from_plan_to_plan_where_that_is_asked_those_of_each_episode_its_own():
+    fresh, kept = Counting(), Counting()
+    control(replace(FREE, method=fresh), [0], steps=2)
+    control(replace(FREE, method=kept, resume=True), [0], steps=2)
+    assert fresh.begun == [[0], [1], [2]] * 2
+    assert kept.begun == [[0], [1], [2], [3], [4], [5]]
+    resumed = _Resumed(Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1))
+    some = _Resumed(Counting(), 0, resumed.of(np.array([True, False, True])))
+    assert some.init(torch.zeros(2, H, 2), LIMIT)[:, 0].tolist() == [1, 3]
+
+
+def test_the_safest_of_k_plans_is_executed():
+    """Plans whose speed is noise alone, on an episode's own draws: the more there are, the less the one that is kept is over."""
+
+    def noisy(x: torch.Tensor, t: int) -> torch.Tensor:
+        return x
+
+    low = chain(Affine(vec(0.0, 1.0), vec(0.1).squeeze()), 0.5)
+    acting = replace(FREE, denoiser=noisy, g=low, enforced=low)
+    one, many = (control(replace(acting, method=BestOf(k)), [0, 1, 2], steps=4) for k in (1, 16))
+    assert many.violation[:, :4].mean() < 0.7 * one.violation[:, :4].mean()
+    same(one, control(acting, [0, 1, 2], steps=4), slice(0, 3))  # the first candidate is the seed's own plan
+    same(many, control(replace(acting, method=BestOf(16)), [1], steps=4), slice(1, 2))
+    assert replace(acting, method=BestOf(16)).calls == 48
+
+
+def test_a_candidate_that_is_not_finite_is_not_kept():
+    def broken(x: torch.Tensor, t: int) -> torch.Tensor:
+        z = mean_window(x, t)
+        return torch.cat((torch.full_like(z[:1], torch.nan), z[1:]))
+
+    assert not control(replace(FREE, denoiser=broken, method=BestOf(2)), [0], steps=3).diverged.any()
+
+
+@pytest.mark.parametrize("method", [Projected(), PrimalDual(), PrimalDual(on="noisy", eta=0.1), AugmentedLagrangian()])
+def test_rows_as_one_matrix_give_the_plans_that_part_by_part_gives(method, monkeypatch):
+    """To 1e-6: the order of additions in float32 differs."""
+    both = Constraint((*LIMIT.parts, *chain(Affine(vec(0.0, -1.0), vec(0.2).squeeze()), 0.3).parts))
+    acting = replace(FREE, method=method, g=both, enforced=both, polish=True)
+    assert acting.condensed is not None
+    fast = control(acting, [0, 1, 2])
+    monkeypatch.setattr("cdiff_cli.control.condensed", lambda *_: None)
+    plain = control(replace(acting, polish=True), [0, 1, 2])
+    np.testing.assert_allclose(fast.x, plain.x, atol=1e-6)
+    np.testing.assert_allclose(fast.planned, plain.planned, atol=1e-6)
+    assert fast.violation.max() == plain.violation.max() or method.on == "noisy"

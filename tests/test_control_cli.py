@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,10 +12,11 @@ import torch
 import yaml
 from typer.testing import CliRunner
 
+from cdiff_cli import closed_loop
+from cdiff_cli.calibrations import read_calibrations
 from cdiff_cli.checkpoint import card_path, load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.cli import app
-from cdiff_cli.margins import read_margins
-from cdiff_cli.recipe import home
+from cdiff_cli.recipe import home, load_recipe
 from cdiff_cli.runs import read_rows
 
 ROOT = Path(__file__).parent.parent
@@ -141,6 +143,21 @@ def test_options_of_the_environment_are_part_of_what_was_asked(tmp_path):
         assert np.isfinite(done["violation"]).sum() == 13  # 100 steps, a plan each 8
 
 
+@pytest.mark.parametrize("task", ["ball-run", "hopper", "swimmer"])
+@pytest.mark.parametrize("method", ["guidance", "terminal", "final-projection", "best-of-k"])
+def test_the_baselines_act_too(task, method, tmp_path, monkeypatch):
+    """Four steps: that each acts, and makes the network calls it says."""
+    monkeypatch.setattr(closed_loop, "control", partial(closed_loop.control, steps=4))
+    words = ("--method", method, "--episodes", 1, *(("--set", "k=3") if method == "best-of-k" else ()))
+    cdiff("rollout", "--task", task, *words, "--runs", tmp_path)
+    (run,) = tmp_path.iterdir()
+    (row,) = read_rows(run / "rows.csv")
+    assert row["steps"] == 4
+    assert row["calls"] == load_recipe(task).n_steps * (3 if method == "best-of-k" else 1)
+    if method in ("terminal", "final-projection"):
+        assert row["safe_plans"] == 1
+
+
 # margins --------------------------------------------------------------------------------------------------------------
 
 
@@ -149,14 +166,38 @@ def test_calibration_writes_margins_beside_the_checkpoint_and_rollouts_use_them(
     words = (*BALL, "--checkpoint", checkpoint, "--episodes", 3, "--execute", 8)
     stdout = cdiff(*words, "--calibrate", "--level", 0.75, "--runs", tmp_path / "runs").stdout
     assert "margins at level 0.75 from 3 episodes: moving-ball" in stdout
-    found = read_margins(checkpoint)["ball-run"]
-    assert (found.level, found.episodes, found.seed, found.method) == (0.75, 3, 0, "alm")
-    margin = found.constraints["moving-ball"]
+    (found,) = read_calibrations(checkpoint)
+    assert (found.stem, found.level, found.episodes, found.seed) == ("ball-run", 0.75, 3, 0)
+    assert (found.conditions.method, found.conditions.execute, found.conditions.settings["rho"]) == ("alm", 8, 10.0)
+    margin = found.margins["moving-ball"]
     assert margin.margin == max(margin.largest, 0.0)  # the third of three covers three in four
     assert not (tmp_path / "runs").exists()
-    cdiff(*words, "--method", "diffuser", "--runs", tmp_path / "runs")
+    stdout = cdiff(*words, "--runs", tmp_path / "runs").stdout
+    assert "note:" not in stdout
     (run,) = (tmp_path / "runs").iterdir()
-    assert yaml.safe_load((run / "run.yaml").read_text())["margins"] == {"moving-ball": margin.margin}
+    config = yaml.safe_load((run / "run.yaml").read_text())
+    assert config["margins"] == {"moving-ball": margin.margin}
+    assert (config["margins_from"]["match"], config["margins_from"]["calibrated"]["conditions"]["execute"]) == ("exact", 8)
+
+
+def test_a_rollout_says_where_its_margins_were_calibrated_on_something_else(tmp_path):
+    checkpoint = copied(tmp_path)
+    words = (*BALL, "--checkpoint", checkpoint, "--execute", 15)
+    told = "note: no margin was calibrated on"
+    assert told in cdiff(*words, "--episodes", 1, "--runs", tmp_path / "before").stdout
+    cdiff(*words, "--episodes", 1, "--calibrate", "--level", 0.5)
+    said = json.loads(cdiff(*words, "--episodes", 1, "--method", "projected", "--json", "--runs", tmp_path / "runs").stdout)
+    (note,) = said["notes"]
+    assert note.startswith("note: the margins were calibrated with method alm (now projected), settings ")
+    command = f"--task ball-run --method projected --checkpoint {checkpoint} --execute 15"
+    assert f"cdiff rollout --calibrate --level 0.99 --episodes 100 --seed 5000 {command}`" in note
+    (run,) = (tmp_path / "runs").iterdir()
+    told = yaml.safe_load((run / "run.yaml").read_text())["margins_from"]
+    assert (told["match"], told["unlike"]) == ("other", ["method", "settings"])
+
+
+def test_what_ignores_the_constraints_needs_no_margin(tmp_path):
+    assert "note:" not in cdiff(*BALL, "--method", "diffuser", "--episodes", 1, "--execute", 15, "--runs", tmp_path).stdout
 
 
 def test_calibration_as_json_names_its_file(tmp_path):
@@ -164,7 +205,7 @@ def test_calibration_as_json_names_its_file(tmp_path):
     words = ("--method", "diffuser", "--episodes", 1, "--execute", 15, "--calibrate", "--level", 0.5, "--json")
     said = json.loads(cdiff(*BALL, "--checkpoint", checkpoint, *words).stdout)
     assert said["file"] == str(tmp_path / "small.margins.yaml")
-    assert said["constraints"]["moving-ball"]["largest"] >= said["constraints"]["moving-ball"]["margin"] >= 0
+    assert said["margins"]["moving-ball"]["largest"] >= said["margins"]["moving-ball"]["margin"] >= 0
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.95, 19), (0.99, 99), (0.9, 9), (0.75, 3)])
@@ -213,7 +254,6 @@ REFUSED = {
     "warm in a maze": (MAZE, ["--warm", 0.3], ["--warm is for control tasks"]),
     "margin in a maze": (MAZE, ["--margin", 0.1], ["--margin is for control tasks"]),
     "noise in a maze": (MAZE, ["--action-noise", 0.1], ["--action-noise is for control tasks"]),
-    "best of k": (BALL, ["--method", "best-of-k"], ["best-of-k: only for whole plans, and ball-run plans anew"]),
     "constraints of another task": (BALL, ["--constraints", ROOT / "constraints/hopper.yaml"], [":3 task", "change one of them"]),
     "checkpoint of another task": (
         BALL,

@@ -79,7 +79,7 @@ def test_the_shipped_gaits_reach_their_return_without_a_fall(task):
 def test_the_returns_written_down_are_those_asked_for(task):
     path = ROOT / "models" / task.name / "expert.json"
     policies = json.loads(path.read_text())["policies"]
-    assert len({policy["seed"] for policy in policies}) == len(policies) >= 1
+    assert len({policy["seed"] for policy in policies}) == len(policies) >= 2  # several gaits
     for policy in policies:
         assert policy["returns"][0]["noise"] == 0.0
         assert policy["returns"][0]["mean"] >= RETURN[task.name]
@@ -173,6 +173,26 @@ def test_demonstrations_repeat_with_their_seed(task):
     first, again, other = ([e["actions"] for e in task.demonstrate(1300, seed)] for seed in (3, 3, 4))
     assert np.array_equal(np.concatenate(first), np.concatenate(again))
     assert not np.array_equal(np.concatenate(first), np.concatenate(other))
+
+
+def test_the_gaits_take_turns_each_with_bursts_and_without(monkeypatch):
+    gaits = [Gait(np.zeros((2, 8)), np.full(2, b)) for b in (-0.5, 0.5)]
+    monkeypatch.setattr(type(SWIMMER), "experts", lambda _: gaits)
+    task = replace(SWIMMER, noise={0.0: 1.0}, max_steps=300)
+    walked = [np.stack(e["actions"]) for e in task.demonstrate(4000, 0) if len(e["observations"]) >= HORIZON]
+    assert all((u == u[0, 0]).all() for u in walked)
+    turns = [(float(u[0, 0]), len(u) == 300) for u in walked]
+    assert {*turns} == {(-0.5, True), (-0.5, False), (0.5, True), (0.5, False)}
+    steps = [sum(len(u) for u in walked if u[0, 0] == b) for b in (-0.5, 0.5)]
+    assert steps[0] / sum(steps) == pytest.approx(0.5, abs=0.1)  # a turn broken off leaves two of about 14 walks over
+
+
+def test_gaits_that_are_not_named_are_not_demonstrated(monkeypatch):
+    monkeypatch.setattr(type(SWIMMER), "experts", lambda _: [Gait(np.zeros((2, 8)), np.full(2, b)) for b in (-0.5, 0.5)])
+    task = replace(SWIMMER, noise={0.0: 1.0}, max_steps=300, gaits=(1,))
+    for episode in task.demonstrate(1500, 0):
+        if len(episode["observations"]) >= HORIZON:
+            assert (np.stack(episode["actions"]) == 0.5).all()
 
 
 def test_a_fall_never_ends_a_window(monkeypatch):

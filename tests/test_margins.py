@@ -1,4 +1,4 @@
-"""Margins: which errors count, the conformal quantile, the file beside the checkpoint."""
+"""Margins: which errors count, the conformal quantile, what is tightened."""
 
 import math
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
-from cdiff_cli.margins import Margin, Margins, calibrated, conformal, errors, read_margins, require_enough, tightened, write_margins
+from cdiff_cli.margins import conformal, errors, require_enough, tightened
 from tests.problems import vec
 
 
@@ -55,22 +55,3 @@ def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
     parts = [Waypoints(name, Affine(vec(1.0), torch.tensor(3.0, dtype=torch.float64))) for name in ("near", "other")]
     g = tightened(Constraint(tuple(parts)), {"near": 0.25})
     np.testing.assert_allclose(g(torch.full((1, 1, 1), 2.9, dtype=torch.float64))[0], [0.15, -0.1])
-
-
-def found(weights, margin):
-    one = Margin(margin=margin, median=0.0, largest=margin)
-    return Margins(
-        level=0.9, episodes=9, seed=0, weights_sha256=weights, method="alm", preset="recommended", constraints={"a": one}
-    )
-
-
-def test_margins_of_one_file_leave_those_of_others_and_belong_to_their_weights(tmp_path):
-    checkpoint = tmp_path / "small.safetensors"
-    assert read_margins(checkpoint) == {}
-    assert write_margins(checkpoint, "easy", found("w", 0.1)) == tmp_path / "small.margins.yaml"
-    write_margins(checkpoint, "hard", found("w", 0.2))
-    write_margins(checkpoint, "easy", found("w", 0.3))
-    assert calibrated(checkpoint, "w", "easy") == {"a": 0.3}
-    assert calibrated(checkpoint, "w", "hard") == {"a": 0.2}
-    assert calibrated(checkpoint, "other weights", "hard") == calibrated(checkpoint, "w", "unknown") == {}
-    assert [path.name for path in tmp_path.iterdir()] == ["small.margins.yaml"]

@@ -221,3 +221,12 @@ def test_plan_metrics_measure_each_plan_in_the_tasks_columns():
     assert (first["jump"], first["mean_speed"], first["residual"], first["acceleration"]) == pytest.approx((3.0, 3.0, 0.0, 3.0))
     assert (first["wall"], second["wall"]) == (1.0, 0.0)
     assert second["violation"] == 0.0
+
+
+def test_a_single_plan_has_no_distance_to_the_mean_of_several():
+    task = SimpleNamespace(layout=("x", "y"), positions=("x", "y"), velocities=(), dt=1.0)
+    (row,) = plan_metrics(
+        task, Constraint(()), _plan((0.0, 0.0), (1.0, 0.0)), _plan((0.0, 0.0), (1.0, 1.0)), SimpleNamespace(violation=1.0)
+    )
+    assert "distance_paper" not in row
+    assert row["distance"] == pytest.approx(1.0)

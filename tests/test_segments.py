@@ -13,8 +13,8 @@ from cdiff_cli.constraint import Constraint, Pins, Segments, Waypoints, stack
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid
 from cdiff_cli.projection import REFINEMENTS, project
-from cdiff_cli.segments import NEVER, nearest_in_planes, normals, planes, turned
-from tests.problems import F64, ball, chain, half_space, least_distance, normal, num, pin, vec, waypoints
+from cdiff_cli.segments import NEVER, nearest_in_planes, normals, planes
+from tests.problems import F64, ball, chain, least_distance, normal, num, pin, vec, waypoints
 
 SAFE = {F64: 1e-9, torch.float32: 1e-5}  # rounding of coordinates of a few metres, in units of the smallest radius, 0.2
 UNIT = ball(1, centre=(0.0, 0.0), radius=1.0)
@@ -129,32 +129,6 @@ def test_the_planes_of_a_disc_are_tangent_and_none_stands_beyond_the_ends():
     assert torch.equal(a[:, 1:, 0], a[:, :-1, 1])  # a segment's plane holds at both of its ends
     away = (b[:, 1:, 0] - a[:, 1:, 0] @ ball(1).centre) / a[:, 1:, 0].norm(dim=-1)
     torch.testing.assert_close(away, torch.full_like(away, -0.7), atol=1e-12, rtol=0)
-
-
-@quick
-@given(seed=seeds, horizon=st.integers(1, 6), radius=st.sampled_from([0.3, 0.7]))
-def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(seed, horizon, radius):
-    """A half-space that keeps both ends on its side keeps the segment; in metres, as f of a ball is."""
-    z = normal(seed, 3, horizon, 2)
-    g = segments(outside(2, radius))
-    flat = turned(g, z, Pins.none(z))
-    x = z + 0.3 * normal(seed + 1, 3, horizon, 2)
-    rows, _, size = flat.linearise(x)
-    assert rows.shape == (3, 2 * horizon)
-    missing = torch.zeros(2 * horizon, dtype=torch.bool)
-    missing[[0, -1]] = True  # before the first waypoint, after the last
-    torch.testing.assert_close(rows[:, missing], torch.full((3, int(missing.sum())), -1.0, dtype=F64))
-    torch.testing.assert_close(size[:, ~missing], torch.full_like(size[:, ~missing], 2.0))  # |df/dx|^2 = 1, two parts
-    before, after = rows[:, 1:horizon], rows[:, horizon:-1]
-    assert bool((g(x) <= torch.maximum(before, after) + 1e-9).all())
-
-
-def test_turned_leaves_other_parts_as_they_are():
-    wall, inside = Waypoints("w", half_space()), Waypoints("i", ball(-1))
-    g = Constraint((wall, *segments(ball(1)).parts, inside))
-    z = normal(3, 2, 5, 2)
-    parts = turned(g, z, Pins.none(z)).parts
-    assert (parts[0], parts[-1], len(parts)) == (wall, inside, 4)
 
 
 @pytest.mark.parametrize("by", [0.0, 1e-6, 0.01, 0.3])

@@ -111,7 +111,7 @@ def test_description_states_the_inequality(entry, tmp_path):
 def test_shipped_constraints_load(path):
     name = next(task for task in sorted(TASKS, key=len, reverse=True) if path.stem.startswith(task))
     layout, observable = load_task(name).layout, getattr(load_task(name), "observable", ())
-    kinds, g = load_constraints(path, name, layout, None, observable)
+    kinds, g = load_constraints(path, name, layout, None, observable, getattr(load_task(name), "dt", None))
     g = g.bind({quantity: torch.ones(2, dtype=torch.float64) for quantity in observable}, 0.1, 3)
     assert kinds
     values = g(torch.zeros(2, 3, len(layout), dtype=torch.float64))
@@ -303,7 +303,7 @@ def test_json_schema_knows_every_kind_and_refuses_further_fields():
     assert set(schema["required"]) == {"task", "constraints"}
     assert schema["additionalProperties"] is False
     mapping = schema["properties"]["constraints"]["items"]["discriminator"]["mapping"]
-    assert set(mapping) == {"linear", "quadratic", "dcbf", "dynamics"}
+    assert set(mapping) == {"linear", "quadratic", "dcbf", "dynamics", "rate"}
     for reference in mapping.values():
         kind = schema["$defs"][reference.removeprefix("#/$defs/")]
         assert kind["additionalProperties"] is False

@@ -3,12 +3,15 @@
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
-from cdiff_cli import sweep
+from cdiff_cli import closed_loop, sweep
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.runs import COSTS, merge_kinds, newest
 from cdiff_cli.sweep import Matrix, Outcome, plan_sweep, progress_table, run_job
@@ -107,7 +110,12 @@ def test_what_cannot_begin_is_told_and_does_not_stop_the_others(tmp_path):
 
 def test_a_job_runs_on_one_thread_and_leaves_the_number_as_it_was(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr("cdiff_cli.experiment.plan_run", lambda *_, **__: seen.append(torch.get_num_threads()))
+
+    def plan_run(*_, **__):
+        seen.append(torch.get_num_threads())
+        return SimpleNamespace(rows=())
+
+    monkeypatch.setattr("cdiff_cli.experiment.plan_run", plan_run)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     (job,) = plan_sweep(matrix(seeds=[0]), tmp_path).todo
@@ -121,7 +129,28 @@ def test_the_progress_table_counts(tmp_path):
     assert (len(plan.todo), len(plan.refused)) == (2, 2)
     shown = progress_table([*plan.refused, Outcome(plan.todo[0], 2.0)], plan, 0.0)
     assert "0 were there, 1 made, 1 to do" in shown.title
-    assert [list(column.cells) for column in shown.columns][4:] == [["1", "0"], ["0", "2"], ["2", "2"], ["2.0", ""]]
+    assert [list(column.cells) for column in shown.columns][4:] == [["1", "0"], ["0", "0"], ["0", "2"], ["2", "2"], ["2.0", ""]]
+
+
+def test_a_diverged_episode_is_no_clean_cell_neither_when_made_nor_when_it_was_there(tmp_path, monkeypatch):
+    control = closed_loop.control
+
+    def spoilt(controller, seeds, *rest, **more):
+        """The plans of seed 1 are not finite after its first steps."""
+        done = control(controller, seeds, *rest, steps=3, **more)
+        return replace(done, diverged=np.array([seed == 1 for seed in seeds]))
+
+    monkeypatch.setattr(closed_loop, "control", spoilt)
+    words = ("sweep", "--task", "ball-run", "--rollout", "--methods", "diffuser", "--seeds", 2, "--runs", tmp_path)
+    first = cdiff(*words, code=1).stderr
+    assert "made, diverged: rollout-ball-run-ball-run-diffuser-recommended-seed1" in first
+    for said in (first, cdiff(*words, code=1).stderr):
+        (line,) = [line for line in said.splitlines() if line.startswith("diverged: ")]
+        assert "seed1" in line
+        assert "no longer finite" in line
+    plan = plan_sweep(Matrix(["ball-run"], ["diffuser"], ["recommended"], [None], [0, 1, 2], rollout=True), tmp_path)
+    shown = progress_table([], plan, 0.0)
+    assert [list(column.cells) for column in shown.columns][4:] == [["2"], ["1"], ["0"], ["3"], [""]]
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,11 @@ import cdiff_cli.training
 from cdiff_cli.checkpoint import Checkpoint, card_path, install, load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.config import load
 from cdiff_cli.errors import CdiffError, CheckpointError
+from cdiff_cli.examples import end_pins
 from cdiff_cli.recipe import Card, DemonstrationSpec, NetworkSpec, Recipe, TrainSpec, load_recipe
 from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.maze2d import UMAZE
-from cdiff_cli.training import choose_device, data_statistics, end_pins, train
+from cdiff_cli.training import choose_device, data_statistics, train
 
 MODELS = Path(__file__).parent.parent / "models"
 SHIPPED = sorted(MODELS.glob("*/small.safetensors"))

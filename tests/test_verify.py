@@ -31,7 +31,7 @@ def make_run(folder, *plans, kinds=(DISC, CUT_CORNER), rollout=None):
     folder.mkdir(parents=True)
     task, file = load_task("maze2d-umaze"), folder / "constraints.yaml"
     write_yaml(file, {"task": task.name, "constraints": list(kinds)})
-    specs, g = load_constraints(file, task.name, task.layout)
+    specs, g = load_constraints(file, task.name, task.layout, dt=task.dt)
     content = [spec.model_dump(mode="json", exclude_none=True) for spec in specs]
     recorded = {"file": str(file), "sha256": hashlib.sha256(file.read_bytes()).hexdigest(), "content": content}
     run = {"command": ["cdiff", "plan"], "options": {"task": task.name, "n": len(plans)}, "constraints": recorded}

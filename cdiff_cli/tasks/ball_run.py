@@ -5,14 +5,14 @@ by 6 mm within its own step. Ball and obstacle have radius 0.5 m: they touch at 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdiff_cli.tasks.obstacle import PATTERNS
+from cdiff_cli.tasks.obstacle import PATTERNS, beside
 
 Array = NDArray[np.float64]
 
@@ -60,6 +60,13 @@ class BallRun:
     def observed(self, env: Any) -> dict[str, float]:
         """The obstacle's present position (m) and velocity (m/s)."""
         return env.unwrapped.observed()
+
+    def observed_along(self, run: Array, rng: np.random.Generator) -> Mapping[str, Array]:
+        """The obstacle's positions (m) and velocities (m/s) along a run [n, 4] that was recorded without one, each [n]: what it
+        would have shown beside a ghost, which leaves the ball alone, in any of the six patterns, begun as in an episode.
+        """
+        motion = PATTERNS[rng.choice(tuple(PATTERNS))](rng)
+        return dict(zip(self.observable, beside(motion, run[:, :2], self.dt).T, strict=True))
 
     def brake(self, state: Array) -> Array:
         """Inputs that stop the ball as fast as they can: an eighth of a second of full force a m/s."""

@@ -5,7 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Vector = tuple[float, float]
 Velocity = Callable[[float, Vector, Vector, Vector], Vector]
 
@@ -114,3 +116,13 @@ PATTERNS: dict[str, Callable[[np.random.Generator], Motion]] = {
     "random-waypoint": random_waypoint,
     "chaser": chaser,
 }
+
+
+def beside(motion: Motion, path: Array, dt: float) -> Array:
+    """Place and velocity of the obstacle at each step of an agent's path [n, 2], where nothing holds it up [n, 4]."""
+    where, velocity, seen = motion.start, motion.velocity(0.0, motion.start, (0.0, 0.0), tuple(path[0])), []
+    for step, agent in enumerate(path[1:].tolist(), start=1):
+        seen.append((*where, *velocity))
+        where = (where[0] + dt * velocity[0], where[1] + dt * velocity[1])
+        velocity = motion.velocity(dt * step, where, velocity, (agent[0], agent[1]))
+    return np.array([*seen, (*where, *velocity)])

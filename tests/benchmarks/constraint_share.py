@@ -1,6 +1,6 @@
 """What the constraint costs: time of each method's step outside the network, as a share of the network call, in one run.
 
-    python tests/benchmarks/constraint_share.py [--task maze2d-umaze] [--repeats 5]
+    python tests/benchmarks/constraint_share.py [--task maze2d-umaze] [--constraints FILE] [--presets recommended] [--repeats 5]
 
 Medians over the repeats after one warm-up; the network call and the constraint work alternate within each plan, so the ratio
 holds when the machine's speed drifts.
@@ -8,6 +8,7 @@ holds when the machine's speed drifts.
 
 import argparse
 import statistics
+from pathlib import Path
 
 from cdiff_cli.methods import METHODS
 from cdiff_cli.planning import plan
@@ -17,13 +18,17 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--task", default="maze2d-umaze")
 parser.add_argument("--repeats", type=int, default=5)
 parser.add_argument("--n", type=int, default=10)
+parser.add_argument("--constraints", type=Path, help="default: the task's own")
+parser.add_argument("--presets", default="paper,released,recommended")
+parser.add_argument("--methods", default=",".join(name for name in METHODS if name != "conditional"))  # that has its own network
 arguments = parser.parse_args()
 
-print(f"{arguments.task}, batch {arguments.n}, median of {arguments.repeats}")
+print(f"{arguments.task}, {arguments.constraints or 'its constraints'}, batch {arguments.n}, median of {arguments.repeats}")
 print(f"{'preset':12} {'method':12} {'network / ms':>14} {'outside / ms':>14} {'share / %':>10}")
-for preset in ("paper", "released", "recommended"):
-    for method in (name for name in METHODS if name != "conditional"):  # a network of its own
-        resolved = resolve(Options(task=arguments.task, method=method, preset=preset, n=arguments.n))
+for preset in arguments.presets.split(","):
+    for method in arguments.methods.split(","):
+        options = Options(task=arguments.task, method=method, preset=preset, n=arguments.n, constraints=arguments.constraints)
+        resolved = resolve(options)
         measured = []
         for _ in range(arguments.repeats + 1):
             plans = plan(

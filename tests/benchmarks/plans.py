@@ -1,6 +1,6 @@
 """Whole plans: how long a user waits, and where the time goes. One run; medians after a warm-up.
 
-    python tests/benchmarks/plans.py [--batches 1,10,100] [--repeats 7] [--threads 2]
+    python tests/benchmarks/plans.py [--tasks maze2d-umaze] [--batches 1,10,100] [--repeats 7] [--threads 2]
 
 For each maze its disc constraint, preset `fast` (16 calls) and `recommended`, with the dynamics and without them. The bare network
 calls of the same run are the floor: `ratio` is plan time over theirs.
@@ -27,13 +27,14 @@ parser.add_argument("--batches", default="1,10,100")
 parser.add_argument("--repeats", type=int, default=7)
 parser.add_argument("--threads", type=int, default=2)
 parser.add_argument("--presets", default="fast,recommended")
+parser.add_argument("--tasks", default="maze2d-umaze,maze2d-large")
 arguments = parser.parse_args()
 torch.set_num_threads(arguments.threads)
 
 table = Table(title=f"alm, {arguments.threads} threads, medians of {arguments.repeats}")
 for head in ("task", "preset", "dynamics", "batch", "calls", "plan / ms", "network / ms", "ratio", "plans / s"):
     table.add_column(head, justify="left" if head in ("task", "preset", "dynamics") else "right", no_wrap=True)
-for task in ("maze2d-umaze", "maze2d-large"):
+for task in arguments.tasks.split(","):
     for preset in arguments.presets.split(","):
         for with_dynamics in (False, True):
             for batch in map(int, arguments.batches.split(",")):

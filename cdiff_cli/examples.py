@@ -1,0 +1,131 @@
+"""What a network is trained on: windows in its own coordinates and, of a conditional planner, their labels."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cdiff_cli.conditioning import Condition, Telling, drop
+from cdiff_cli.data import Array, Normaliser, Windows
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.frames import Frame
+from cdiff_cli.recipe import Recipe, TrainSpec
+from cdiff_cli.tasks import ControlTask, Task
+
+SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
+COPIES = 8  # of the demonstrations, each beside other observed quantities
+
+Draw = Callable[[int, torch.Generator], tuple[Tensor, Tensor | None]]
+"""(how many, generator) -> windows and, of a conditional planner, their labels."""
+
+
+def end_pins(horizon: int, dim: int) -> Tensor:
+    """Mask [horizon, dim] of the coordinates given clean in training: the whole first and last state."""
+    pinned = torch.zeros(horizon, dim, dtype=torch.bool)
+    pinned[[0, -1]] = True
+    return pinned
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What would have been observed beside the demonstrations, had there been something to observe: several times over, for each
+    is one of many.
+
+    names    of the quantities
+    values   in the order of the windows' states   [copies, n, k]
+    telling  how a network is told of them
+    """
+
+    names: tuple[str, ...]
+    values: Tensor
+    telling: Telling
+
+    @classmethod
+    def of(cls, task: Task, episodes: Sequence[Array], names: tuple[str, ...], seed: int) -> "Beside":
+        """Drawn by the task's own law (observed_along); CdiffError where it has none."""
+        law = getattr(task, "observed_along", None)
+        if law is None:
+            raise CdiffError(
+                f"{task.name}: the constraints observe {', '.join(names)}, which demonstrations do not hold, and the task has no "
+                "observed_along to draw them by; train for constraints without observed quantities"
+            )
+        rng = np.random.default_rng(seed)
+        copies = []
+        for _ in range(COPIES):
+            seen = [law(episode, rng) for episode in episodes]
+            copies.append(np.concatenate([np.stack([each[name] for name in names], 1) for each in seen]))
+        values, states = torch.from_numpy(np.stack(copies)), torch.from_numpy(np.concatenate(episodes))
+        every = values.flatten(0, 1).unbind(1)
+        return cls(names, values, Telling.fit(names, task.layout, every, states.repeat(COPIES, 1)))
+
+    def draw(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """Each quantity as it was at those states [n], in a copy drawn at random."""
+        copy = torch.randint(COPIES, (len(rows),), generator=generator)
+        return self.values[copy, rows].unbind(1)
+
+
+@dataclass(frozen=True)
+class Data:
+    """The windows that a network is trained on, in its own coordinates.
+
+    frame    of relative windows; None where the data's limits are the coordinates
+    pinned   coordinates given clean, in training as in sampling   [horizon, dim]
+    beside   quantities that the condition observes; None of the others
+    """
+
+    windows: Windows
+    normaliser: Normaliser
+    frame: Frame | None
+    pinned: Tensor
+    condition: Condition | None
+    dropout: float
+    dt: float
+    beside: Beside | None
+
+    @classmethod
+    def of(
+        cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array], condition: Condition | None, seed: int
+    ) -> "Data":
+        observed = condition.observed if condition else ()
+        asked = condition, spec.dropout, task.dt, Beside.of(task, episodes, observed, seed) if observed else None
+        pinned = end_pins(recipe.horizon, len(task.layout))
+        if recipe.frame == "relative":
+            windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
+            frame = Frame.fit(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
+            pinned[-1] = False
+            return cls(windows, frame.state, frame, pinned, *asked)
+        normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)
+        windows = Windows.of([normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes], recipe.horizon)
+        if task.velocities:
+            columns = [[task.layout.index(name) for name in names] for names in (task.positions, task.velocities)]
+            windows = windows.favour_trips(spec.trips, *columns)
+        return cls(windows, normaliser, None, pinned, *asked)
+
+    def draw(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        """n windows and, of a conditional planner, what it is told of them; of some of them nothing."""
+        index = self.windows.pick(n, generator)
+        x = self.windows[index]
+        z = x if self.frame is None else self.frame.encode(x)
+        if self.condition is None:
+            return z, None
+        states = x if self.frame is not None else self.normaliser.decode(x.double())
+        if self.beside is None:
+            return z, drop(self.condition.label(states), self.dropout, generator)
+        seen = self.beside.draw(self.windows.starts[index], generator)
+        label = self.condition.label(states, dict(zip(self.beside.names, seen, strict=True)), self.dt)
+        told = self.beside.telling(seen, states[:, 0])
+        return z, drop(torch.cat((label, told), 1), self.dropout, generator)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a checkpoint keeps of them."""
+        sample = self.windows[torch.linspace(0, len(self.windows.starts) - 1, SAMPLES).long()].double()
+        kept = {"normaliser.centre": self.normaliser.centre, "normaliser.scale": self.normaliser.scale}
+        if self.frame is None:
+            return kept | {"demonstrations": self.normaliser.decode(sample).float()}
+        if self.beside is not None:
+            kept |= {f"telling.{name}": value.contiguous() for name, value in vars(self.beside.telling).items()}
+        kept |= {f"frame.{name}": getattr(self.frame, name).contiguous() for name in ("seen", "mean", "gain", "scale")}
+        return kept | {"demonstrations": sample.float()}
