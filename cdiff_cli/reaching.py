@@ -7,6 +7,10 @@ active: an active-set method solves for their multipliers, a small system a plan
 violated. All rows that are wrong change sides at once (the primal-dual active set method: Hintermueller, Ito and Kunisch, 2003);
 where that makes no progress, one alone, which cannot cycle (block principal pivoting: Judice and Pires, 1994). The result is the
 minimiser, to rounding. Plans that are done leave the batch.
+
+Where active rows that all push cannot be met together, no trajectory meets all rows (Farkas): the plan turns soft. A row that it
+misses then costs the square of that, over GIVE, and a minimiser there always is. Plans are known to be soft at the next call, which
+gives them AGAIN changes from where they were and no more, until their rows can nearly be met.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,23 +28,25 @@ from cdiff_cli.tracking import Tracking, tracking
 GIVE_U, GIVE_P = 5e-4, 2e-6  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
 REFINED = 3  # solutions of a system, the later ones from where the one before gave way: rows that can be met then are, to rounding
 PIVOTS, PATIENCE = 200, 12  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
-CONTRADICTED = 1e-3  # violation of active rows that all push: no trajectory meets them together (Farkas), and the search ends
+CONTRADICTED = 1e-3  # violation of active rows that all push from which they turn soft, and up to which soft ones turn hard again
+SOFTLY, AGAIN = 30, 2  # changes of the active set of a plan at most once it is soft; where it was soft before
 RUN = 8  # waypoints on either side among which one half-space enters at once, the one that is violated most
 RHO, RELAXATION = 5.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
 
 
 class Warm(NamedTuple):
-    """Where the last call ended: which rows were active (1 at their upper bound, -1 at their lower), the inputs, and of ADMM
-    copies and scaled multipliers, where it was needed.
+    """Where the last call ended: which rows were active (1 at their upper bound, -1 at their lower), the inputs, of ADMM
+    copies and scaled multipliers, where it was needed, and which plans were soft.
 
-    active [batch, steps, rows], u [batch, steps, m], copy, push [batch, horizon, k]
+    active [batch, steps, rows], u [batch, steps, m], copy, push [batch, horizon, k], soft [batch]
     """
 
     active: Tensor
     u: Tensor
     copy: Tensor
     push: Tensor
+    soft: Tensor
 
     def of(self, which: Tensor) -> "Warm":
         """Of some trajectories of the batch alone."""
@@ -68,7 +74,7 @@ def nearest_reachable(
     weight       of each coordinate in the distance   [n]
     rounds       of ADMM at most, where there is `rest`; it stops where the copy is within the tolerance
     turns        times at most that a plan's tangent planes (segments.py) are chosen: first at z where that is unsafe, then at the
-                 last result; a plan that needs none has none
+                 last result; a plan that needs none has none, one that stays soft is given them once
     tolerance    violation of a row that is let pass
     """
     (batch, horizon, n), m = z.shape, dynamics.B.shape[1]
@@ -76,14 +82,16 @@ def nearest_reachable(
     slots, x = _slots(parts), z.double()
     if warm is None or warm.active.shape != (batch, horizon - 1, m + slots):
         active = torch.zeros(batch, horizon - 1, m + slots, dtype=torch.int8, device=z.device)
-        warm = Warm(active, dynamics.inputs(z).double(), held.values, torch.zeros_like(held.values))
+        warm = Warm(
+            active, dynamics.inputs(z).double(), held.values, torch.zeros_like(held.values), torch.zeros_like(z[:, 0, 0]).bool()
+        )
     if batch == 0 or horizon == 1:
         return z, warm
     heavy = tuple(v + RHO * (rest is not None and i in used) for i, v in enumerate(weight.tolist()))
     numbers = tuple(tuple(v.flatten().tolist()) for v in (dynamics.A, dynamics.B, dynamics.c))
     track = tracking(numbers, heavy, horizon - 1, bool(pins.mask[-1].all()), z.device)
-    active, _, copy, push = warm
-    active = active.clone()
+    active, _, copy, push, soft = warm
+    active, soft = active.clone(), soft.clone()
     g, at, free = Constraint(tuple(parts)), held.values, ~held.mask[1:].any(1)
     rows = Bounds(dynamics.low.double(), dynamics.high.double(), where, max(tolerance, 1e-9))
     a = x.new_zeros(batch, horizon - 1, slots, len(where))
@@ -102,7 +110,7 @@ def nearest_reachable(
         if rest or k == 0:
             w0 = track.solve(_toward(x, weight.double(), copy - push, where) if rest else x, torch.zeros_like(w))
         active[..., m:] *= b < NEVER  # a warm start may know rows that are not there now
-        w[some], active[some] = settle(track, w0[some], rows, a[some], b[some], active[some])
+        w[some], active[some], soft[some] = settle(track, w0[some], rows, a[some], b[some], active[some], soft[some])
         at = torch.cat((held.values[:, :1], w[..., where]), 1)
         unsafe = (g(at) > rows.tolerance).any(1)
         if rest:
@@ -113,12 +121,12 @@ def nearest_reachable(
             if tolerance and k % 5 == 4 and float((at - copy).abs().max()) < tolerance:
                 break
             continue
-        touched = unsafe & ~walled | walled & (k + 1 < turns)
+        touched = unsafe & ~walled | walled & ~(soft & warm.soft) & (k + 1 < turns)
         some = touched.nonzero()[:, 0]
         if not len(some):
             break
     out = torch.cat((x[:, :1], w[..., :n]), 1)
-    return out.to(z), Warm(active, w[..., n:], copy, push)
+    return out.to(z), Warm(active, w[..., n:], copy, push, soft)
 
 
 def _slots(parts: Sequence[Waypoints | Segments]) -> int:
@@ -142,41 +150,49 @@ class Bounds(NamedTuple):
     tolerance: float
 
 
-def settle(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
+def settle(
+    track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """The nearest w to the unconstrained w0 [batch, steps, n + m] within the bounds and a.x <= b, from that active set.
 
-    a [batch, steps, slots, k], b [batch, steps, slots] of the state that each step leads to; w and the active set
+    a [batch, steps, slots, k], b [batch, steps, slots] of the state that each step leads to; soft [batch] which plans are
+    w, the active set, and which plans are soft now
     """
-    w, active = w0.clone(), active.clone()
+    w, active, soft = w0.clone(), active.clone(), soft.clone()
     y = w0.new_zeros(active.shape)
     kept = torch.zeros_like(y)  # multipliers of the right sign, of plans that go one row at a time
     fewest = torch.full((len(w0),), active[0].numel() + 1, device=w0.device)
-    left = torch.full_like(fewest, PATIENCE)
+    left, tries = torch.full_like(fewest, PATIENCE), torch.where(soft, AGAIN, PIVOTS)
     todo = active.flatten(1).any(1).nonzero()[:, 0]
     if len(todo):
-        w[todo], y[todo] = _at_active(track, w0[todo], bounds, a[todo], b[todo], active[todo])
+        w[todo], y[todo] = _at_active(track, w0[todo], bounds, a[todo], b[todo], active[todo], soft[todo])
     todo = torch.arange(len(w0), device=w0.device)
-    for _ in range(PIVOTS):
+    while True:
         was, push = active[todo], y[todo]
         over = _over(w[todo], bounds, a[todo], b[todo])
         enter = _foremost(torch.where(was == 0, over, 0.0), len(bounds.low)).sign().to(torch.int8)
         asked = torch.where(was * push > 0, was, enter)
         wrong = (asked != was).flatten(1).sum(1)
-        contradicted = torch.where(was == 0, 0.0, over).abs().flatten(1).amax(1) > CONTRADICTED
-        proved = contradicted & (left[todo] < 0) & ~((was != 0) & (was * push <= 0)).flatten(1).any(1)
-        open_ = (wrong > 0) & ~proved
+        missed = over.abs() > CONTRADICTED
+        pushing = ~((was != 0) & (was * push <= 0)).flatten(1).any(1)
+        proved = pushing & ~soft[todo] & (missed & (was != 0)).flatten(1).any(1)
+        new = todo[proved]
+        soft[new], tries[new], left[new], fewest[new] = True, SOFTLY, PATIENCE, active[0].numel() + 1
+        open_ = proved | (wrong > 0) & (tries[todo] > 0)
+        soft[todo[~open_]] = ((wrong > 0) | missed.flatten(1).any(1))[~open_]
         if not bool(open_.any()):
             break
         if not bool(open_.all()):
             todo, was, push, over, enter, asked, wrong = (v[open_] for v in (todo, was, push, over, enter, asked, wrong))
         slow = left[todo] < 0
+        tries[todo] -= 1
         left[todo] = torch.where(slow, left[todo], torch.where(wrong < fewest[todo], PATIENCE, left[todo] - 1))
         fewest[todo] = torch.minimum(wrong, fewest[todo])
         if bool(slow.any()):
             asked[slow], kept[todo[slow]] = _one_at_a_time(was[slow], push[slow], kept[todo[slow]], over[slow], enter[slow])
         active[todo] = asked
-        w[todo], y[todo] = _at_active(track, w0[todo], bounds, a[todo], b[todo], asked)
-    return w, active
+        w[todo], y[todo] = _at_active(track, w0[todo], bounds, a[todo], b[todo], asked, soft[todo])
+    return w, active, soft
 
 
 def _over(w: Tensor, bounds: Bounds, a: Tensor, b: Tensor) -> Tensor:
@@ -215,8 +231,12 @@ def _one_at_a_time(active: Tensor, y: Tensor, kept: Tensor, over: Tensor, enter:
     return torch.where(right, torch.where(first, enter, active), torch.where(gone, 0, active)), kept
 
 
-def _at_active(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """w with the active rows met, and their multipliers y: w = w0 - K C^T y, (C K C^T + give) y = C w0 - bound."""
+def _at_active(
+    track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor
+) -> tuple[Tensor, Tensor]:
+    """w with the active rows met, and their multipliers y: w = w0 - K C^T y, (C K C^T + give) y = C w0 - bound, give next to nothing
+    where plans are not soft.
+    """
     batch, steps, rows = active.shape
     width, m = w0.shape[2], len(bounds.low)
     signs = active.flatten(1)
@@ -254,8 +274,9 @@ def _at_active(track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor
     size = Q.diagonal(dim1=1, dim2=2).rsqrt()
     factor = torch.linalg.cholesky_ex(Q * size[:, :, None] * size[:, None])[0]
     multiplier = torch.zeros_like(wanted)
+    again = torch.where(soft[:, None], 0.0, give)
     for _ in range(REFINED):
-        multiplier = size * torch.cholesky_solve((size * (wanted + give * multiplier))[..., None], factor)[..., 0]
+        multiplier = size * torch.cholesky_solve((size * (wanted + again * multiplier))[..., None], factor)[..., 0]
     pull = w0.new_zeros(batch, steps * width)
     pull.scatter_add_(1, at.flatten(1), (-multiplier[..., None] * coefficient).flatten(1))
     y[plan, row] = multiplier[plan, slot]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cdiff_cli.constraint import Segments, Waypoints
 from cdiff_cli.levels import Affine
-from cdiff_cli.reaching import Bounds, _at_active, nearest_reachable, settle
+from cdiff_cli.reaching import AGAIN, Bounds, _at_active, nearest_reachable, settle
 from cdiff_cli.segments import planes
 from cdiff_cli.tracking import tracking
 from tests.problems import F64, ball, normal, num, pin, vec
@@ -105,6 +105,36 @@ def test_rows_that_contradict_each_other_are_missed_by_both():
     assert float(warm.u.abs().max()) > 1.5
 
 
+def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_solved_once_it_is_feasible(monkeypatch):
+    """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
+    d = maze(bound=0.3)
+    z = trip()
+    near, far = (Segments("disc", ball(1, centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0))
+    _, warm = solve(d, z, pin(z, 0, 63), [near])
+    assert warm.soft.tolist() == [True]
+    solved = []
+    monkeypatch.setattr("cdiff_cli.reaching._at_active", lambda *of: solved.append(len(of[1])) or _at_active(*of))
+    x, warm = solve(d, z + 1e-3, pin(z + 1e-3, 0, 63), [near], warm=warm, turns=3)
+    assert len(solved) <= 1 + AGAIN
+    assert warm.soft.tolist() == [True]
+    assert bool(torch.isfinite(x).all())
+    expected, _ = solve(maze(), z, pin(z, 0, 63), [far])
+    for _ in range(4):  # rows that pull where nothing is in the way any more leave all at once, then the inputs settle
+        x, warm = solve(maze(), z, pin(z, 0, 63), [far], warm=warm)
+    assert warm.soft.tolist() == [False]
+    torch.testing.assert_close(x, expected, atol=1e-8, rtol=0)
+
+
+def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give():
+    """Two walls that face away from each other, a decimetre apart: the path ends in the middle between them."""
+    d, z = maze(bound=1e6), torch.zeros(1, 3, 4, dtype=F64)
+    z[:, 1:, 0] = 0.05
+    walls = [Waypoints("below", Affine(vec(1.0, 0.0), num(0.0))), Waypoints("above", Affine(vec(-1.0, 0.0), num(-0.1)))]
+    x, warm = solve(d, z, pin(z, 0), walls)
+    assert warm.soft.tolist() == [True]
+    torch.testing.assert_close(x[0, 1:, 0], vec(0.05, 0.05), atol=1e-4, rtol=0)  # the way there has a cost too: 1e-5
+
+
 def test_a_plan_does_not_depend_on_the_others_of_its_batch():
     d = maze()
     _, z = noisy_path(d, 9, 6, 40)
@@ -150,6 +180,6 @@ def test_settling_nothing_returns_the_unconstrained_solution():
     track = tracking(numbers, tuple(WEIGHT.tolist()), 7, False, w0.device)
     none = torch.zeros(2, 7, 2, dtype=torch.int8)
     empty = (w0.new_zeros(2, 7, 0, 0), w0.new_zeros(2, 7, 0))
-    w, active = settle(track, w0, Bounds(d.low, d.high, [], 1e-9), *empty, none)
+    w, active, soft = settle(track, w0, Bounds(d.low, d.high, [], 1e-9), *empty, none, torch.zeros(2).bool())
     assert torch.equal(w, w0)
-    assert not bool(active.any())
+    assert not bool(active.any() | soft.any())
