@@ -15,6 +15,7 @@ from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.planning import CLEARANCE
 from cdiff_cli.projection import project, project_from
+from cdiff_cli.rates import Rate, limits
 from cdiff_cli.reaching import nearest_reachable
 from tests.problems import F64, ball, normal, num, pin, saddle, vec
 
@@ -371,6 +372,20 @@ def test_a_chain_a_disc_and_a_wall_hold_at_once():
     )
     x, _ = project_from(g, z, pin(z, 0, 63), None, 1000)
     assert float(g(x).max()) <= 1e-3  # no closed form holds them all at once, and ADMM has not ended
+
+
+def test_a_speed_limit_and_a_disc_hold_at_once():
+    """The limit has no half-spaces at waypoints: its own projection (rates.py) takes turns with the active set."""
+    z = trip()
+    one = torch.ones(4, dtype=F64)
+    slow = Rate("slow", torch.eye(4, dtype=F64)[:2], *limits(None, 2.3), True, 0.01, torch.zeros_like(one), one)
+    g = Constraint((reachable(maze(), weight=WEIGHT), slow, Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))))
+    assert float(slow(z).max()) > 0.3
+    x, warm = project_from(g, z, pin(z, 0, 63), None, 600, 5e-5)
+    assert float(slow(x).max()) <= 2 * 5e-5 / 0.01  # m/s: both ends of a segment within the tolerance, over dt
+    assert float(g.parts[2](x).max()) <= 5e-5
+    assert float(warm.u.abs().max()) <= 1 + 5e-5
+    torch.testing.assert_close(x[:, [0, 63]], z[:, [0, 63]], atol=1e-9, rtol=0)
 
 
 def test_two_sets_of_dynamics_are_refused():
