@@ -24,6 +24,7 @@ from cdiff_cli.tasks import Task
 Array = NDArray[np.float64]
 MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
 CLEARANCE = 5e-3  # the same where dynamics are obeyed: the execution stays near the plan, not on it
+TOUCHING = 1e-5  # what remains of it where it leaves no plan
 
 
 @dataclass(frozen=True)
@@ -224,23 +225,28 @@ def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
 
 def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array]:
     """Plans near z that the dynamics make, and their inputs: solved as finely as it takes for the rollout of the inputs to be safe
-    and to end within a millimetre of the pinned state.
+    and to end within a millimetre of the pinned state. Where no plan keeps CLEARANCE, as from a start that does not, one that keeps
+    TOUCHING is taken if that is safe and ends there.
     """
     (reachable,) = dynamics_of(problem.enforced)
     scale, dynamics = problem.normaliser, reachable.dynamics
-    g = pull_back(_tighten_others(problem.enforced, CLEARANCE), scale.centre, scale.scale)
     todo, warm = torch.arange(len(z)), None
     x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
-    for tolerance in (5e-4, 5e-5, 5e-6):
-        near, warm = project_from(g.take(todo), z[todo], Pins(pins.mask, pins.values[todo]), warm, ADMM_ROUNDS, tolerance)
+    for clearance, tolerance in ((CLEARANCE, 5e-4), (CLEARANCE, 5e-5), (CLEARANCE, 5e-6), (TOUCHING, 5e-6)):
+        g = pull_back(_tighten_others(problem.enforced, clearance), scale.centre, scale.scale).take(todo)
+        pinned = pins.values[todo]
+        warm = warm if clearance == CLEARANCE else None
+        near, warm = project_from(g, z[todo], Pins(pins.mask, pinned), warm, ADMM_ROUNDS, tolerance)
         assert warm is not None
-        u[todo] = torch.clamp(warm.u, dynamics.low, dynamics.high)
-        x[todo] = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), u[todo]))
-        missed = (scale.scale * torch.where(pins.mask, x[todo] - pins.values[todo], 0.0)).abs().amax((1, 2)) > 1e-3
-        unsafe = (split(problem.enforced)[0](scale.decode(x[todo])) > 0).any(1)
-        if not bool((missed | unsafe).any()):
+        made = torch.clamp(warm.u, dynamics.low, dynamics.high)
+        path = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), made))
+        missed = (scale.scale * torch.where(pins.mask, path - pinned, 0.0)).abs().amax((1, 2)) > 1e-3
+        wrong = missed | (split(problem.enforced)[0](scale.decode(path)) > 0).any(1)
+        kept = ~wrong | (clearance == CLEARANCE)
+        x[todo[kept]], u[todo[kept]] = path[kept], made[kept]
+        if not bool(wrong.any()):
             break
-        warm, todo = warm.of(missed | unsafe), todo[missed | unsafe]
+        warm, todo = warm.of(wrong), todo[wrong]
     return x, u.numpy()
 
 

@@ -128,6 +128,18 @@ def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolve
         assert np.abs(plans.x[0, -1] - problem.goal).max() < 1e-3
 
 
+def test_a_start_closer_to_the_boundary_than_the_clearance_does_not_cost_the_goal(resolved, plans):
+    """No plan is 5 mm inside a step after a start that is a millimetre inside: the polish takes one that is inside at all."""
+    floor = torch.tensor(1e-3 - resolved.problem.start[1], dtype=torch.float64)
+    near = Waypoints("near", Affine(torch.tensor([0.0, -1.0, 0.0, 0.0], dtype=torch.float64), floor))
+    problem = replace(resolved.problem, enforced=Constraint((near, *dynamics_of(resolved.problem.enforced))))
+    x, _, u = polish_plans(problem, problem.normaliser.encode(torch.from_numpy(plans.x)))
+    x = problem.normaliser.decode(x)
+    assert float(near(x).max()) <= 0.0
+    assert np.abs(u).max() <= 1.0
+    np.testing.assert_allclose(x[:, -1].numpy(), np.tile(problem.goal, (2, 1)), atol=1e-3)
+
+
 def test_the_trace_counts_the_constraints_as_they_are_scored_and_not_the_dynamics(resolved):
     scored = Constraint(tuple(part for part in resolved.problem.g.parts if part not in dynamics_of(resolved.problem.g)))
     problem = replace(resolved.problem, g=scored)
