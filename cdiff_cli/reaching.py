@@ -234,8 +234,8 @@ def _one_at_a_time(active: Tensor, y: Tensor, kept: Tensor, over: Tensor, enter:
 def _at_active(
     track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """w with the active rows met, and their multipliers y: w = w0 - K C^T y, (C K C^T + give) y = C w0 - bound, give next to nothing
-    where plans are not soft.
+    """w with the active rows met, and their multipliers y: w = w0 - K C^T y, (C K C^T + give) y = C w0 - bound. Of plans that are
+    not soft, give hardly counts.
     """
     batch, steps, rows = active.shape
     width, m = w0.shape[2], len(bounds.low)
