@@ -35,7 +35,8 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     kinds, g = load_constraints(file, name, task.layout, fitted, observable, getattr(task, "dt", None))
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
-    table = Table(title=f"{file}: {len(kinds)} constraints on {name}, all of them at once", title_justify="left")
+    count = "1 constraint" if len(kinds) == 1 else f"{len(kinds)} constraints, all of them at once,"
+    table = Table(title=f"{file}: {count} on {name}", title_justify="left")
     for heading in ("name", "kind", "meaning", "rows", "coordinates", "projection", "demonstrations that obey"):
         table.add_column(heading, overflow="fold")
     for spec, part in zip(kinds, g.parts, strict=True):

@@ -14,9 +14,13 @@ ROOT = Path(__file__).parent.parent
 REFERENCE = ROOT / "runs" / "reference"
 MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-PAPER = ("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "jump", "torn", "wall", "calls")
+PAPER = (
+    *("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "unsafe_segments"),
+    *("jump", "torn", "wall", "calls"),
+)
+FEW = ("distance", "wall", "residual", "effort", "safe_segments", "safe_executed", "success")
 SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
-BRIEF = ("distance", "violation_paper", "worst_segment", "torn", "wall")
+BRIEF = ("distance", "violation_paper", "unsafe_segments", "torn", "wall")
 IN_BRIEF = ("reward", "violation_rate", "executed_violation", "safe_executed", "fell")
 CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
 BALL = ("reward", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "contacts", "braked", "calls")
@@ -65,6 +69,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "table2-hopper": lambda: of_rows("table2-hopper", CONTROL, paper=True),
     "table2-swimmer": lambda: of_rows("table2-swimmer", CONTROL, paper=True),
     "table3": lambda: of_rows("table3", BALL, paper=True),
+    "few-steps": lambda: of_rows("few-steps", FEW),
     "quality": lambda: of_rows("quality", QUALITY),
     "metrics": of_metrics,
 }
