@@ -18,7 +18,7 @@ from cdiff_cli.control import Controller, control
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
-from cdiff_cli.margins import Array, errors, require_enough, tightened, until_covered
+from cdiff_cli.margins import Array, excess, require_enough, tightened, until_covered
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
 from cdiff_cli.request import Resolved
@@ -75,7 +75,7 @@ def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
         done = control(inside, seeds, env, on_step=lambda k, steps: tick("control", k, steps))
         if done.diverged.any():
             raise CdiffError(f"{_diverged(done)}: no margin covers that; nothing was written")
-        return errors(done.foreseen, metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt))
+        return excess(done.foreseen, metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt), margins)
 
     margins, scores, passes = until_covered(measured, len(names), level)
     return Calibration(

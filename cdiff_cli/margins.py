@@ -35,12 +35,12 @@ def errors(foreseen: Array, executed: Array) -> Array:
 
 
 def until_covered(measured: Callable[[Array], Array], parts: int, level: float) -> tuple[Array, Array, int]:
-    """Margins [parts] that cover the errors of plans that keep those same margins, the errors [n, parts], and the passes it took.
+    """Margins [parts] that cover the excess of plans that keep those same margins, that excess [n, parts], and the passes it took.
     Plans that stay clear of a limit are other plans than those that ride it, so what covers the errors of the one need not cover
     those of the other: each pass acts with the margins found so far, on episodes of its own, until they suffice. Where they do
     not, they are raised by twice what is missing. The last pass fits nothing: it confirms. CdiffError where none does.
 
-    measured   margins to the errors() of new episodes
+    measured   margins to the excess() of new episodes
     """
     margins = np.zeros(parts)
     for k in range(1, PASSES + 1):
@@ -54,6 +54,14 @@ def until_covered(measured: Callable[[Array], Array], parts: int, level: float) 
         f"no margin found in {PASSES} passes: execution leaves the plans the further, the more clear of the limit they keep "
         f"(the last margins tried: {', '.join(f'{margin:.3g}' for margin in margins)}); nothing was written"
     )
+
+
+def excess(foreseen: Array, executed: Array, margins: Array) -> Array:
+    """Largest amount by which an episode of plans that keep the margins was less safe than they allow [n, parts]: than its plan, as
+    in errors(), or than the limit less the margin. The second is the larger where small errors of one step add up over many.
+    """
+    worst = np.nan_to_num(executed[:, 1:], nan=-np.inf).max(1)
+    return np.maximum(errors(foreseen, executed), np.where(worst > 0, worst + margins, 0.0))
 
 
 def conformal(scores: Array, level: float) -> float:

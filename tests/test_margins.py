@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
-from cdiff_cli.margins import PASSES, conformal, errors, require_enough, tightened, until_covered
+from cdiff_cli.margins import PASSES, conformal, errors, excess, require_enough, tightened, until_covered
 from tests.problems import vec
 
 
@@ -82,3 +82,17 @@ def test_where_execution_follows_the_plan_the_margin_is_nothing():
     margins, _, passes = until_covered(lambda _: np.full((20, 1), -1.0), 1, level=0.9)
     assert margins.tolist() == [0.0]
     assert passes == 1
+
+
+def test_excess_counts_what_small_errors_add_up_to():
+    """Each step ends 0.01 less safe than its plan, and three in a row pass the limit by 0.02, with a margin of 0.1."""
+    executed = np.array([[[-0.2], [0.0], [0.01], [0.02]]])
+    foreseen = executed - 0.01
+    assert errors(foreseen, executed) == pytest.approx(0.01)
+    assert excess(foreseen, executed, np.array([0.1])) == pytest.approx(0.12)
+
+
+def test_excess_of_a_safe_episode_is_its_error():
+    executed = np.array([[[-0.2], [-0.05], [-0.02], [np.nan]]])
+    foreseen = np.array([[[-0.2], [-0.15], [-0.03], [np.nan]]])
+    assert excess(foreseen, executed, np.array([0.3])) == pytest.approx(errors(foreseen, executed))
