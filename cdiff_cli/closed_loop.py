@@ -13,7 +13,6 @@ import numpy as np
 from cdiff_cli import control_figures, metrics
 from cdiff_cli.baselines import BestOf
 from cdiff_cli.calibrations import Calibration, Margin, write_calibration
-from cdiff_cli.conditioning import content_sha256
 from cdiff_cli.control import Controller, control
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
@@ -23,6 +22,7 @@ from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
 from cdiff_cli.request import Resolved
 from cdiff_cli.runs import Row, new_run, write_rows, write_yaml
+from cdiff_cli.spec import kinds_sha256
 from cdiff_cli.tasks import ControlTask
 from cdiff_cli.training import device_name, git_commit
 
@@ -65,12 +65,10 @@ def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
     require_enough(n, level)
     acting = controller(resolved)
     assert checkpoint is not None
-    env, names, at = parse_env(acting.task, resolved.options.env), [part.name for part in acting.g.parts], 0
+    env, names = parse_env(acting.task, resolved.options.env), [part.name for part in acting.g.parts]
 
-    def measured(margins: Array) -> Array:
-        nonlocal at
-        seeds = [seed + at for seed in resolved.seeds]
-        at += n
+    def measured(margins: Array, number: int) -> Array:
+        seeds = [seed + number * n for seed in resolved.seeds]
         inside = replace(acting, enforced=tightened(acting.enforced, dict(zip(names, margins.tolist(), strict=True))))
         done = control(inside, seeds, env, on_step=lambda k, steps: tick("control", k, steps))
         if done.diverged.any():
@@ -80,7 +78,7 @@ def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
     margins, scores, passes = until_covered(measured, len(names), level)
     return Calibration(
         stem=resolved.constraints_path.stem,
-        content=content_sha256(resolved.kinds),
+        content=kinds_sha256(resolved.kinds),
         constraints={kind.name: kind.describe() for kind in resolved.kinds},
         conditions=resolved.conditions,
         level=level,

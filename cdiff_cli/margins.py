@@ -34,17 +34,17 @@ def errors(foreseen: Array, executed: Array) -> Array:
     return np.asarray(np.where(-foreseen[:, 1:] <= largest, gap, 0.0).max(1))
 
 
-def until_covered(measured: Callable[[Array], Array], parts: int, level: float) -> tuple[Array, Array, int]:
+def until_covered(measured: Callable[[Array, int], Array], parts: int, level: float) -> tuple[Array, Array, int]:
     """Margins [parts] that cover the excess of plans that keep those same margins, that excess [n, parts], and the passes it took.
     Plans that stay clear of a limit are other plans than those that ride it, so what covers the errors of the one need not cover
     those of the other: each pass acts with the margins found so far, on episodes of its own, until they suffice. Where they do
     not, they are raised by twice what is missing. The last pass fits nothing: it confirms. CdiffError where none does.
 
-    measured   margins to the excess() of new episodes
+    measured   margins and the number of the pass, from 0, to the excess() of new episodes
     """
     margins = np.zeros(parts)
     for k in range(1, PASSES + 1):
-        scores = measured(margins)
+        scores = measured(margins, k - 1)
         needed = np.array([conformal(each, level) for each in scores.T])
         if (needed <= margins).all():
             return margins, scores, k

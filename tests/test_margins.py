@@ -61,7 +61,8 @@ def test_margins_cover_the_errors_of_plans_that_keep_them():
     """Errors of 0.1 without a margin and half a margin more with one: 0.1 itself would not do, the least that does is 0.2."""
     asked = []
 
-    def measured(margins):
+    def measured(margins, number):
+        assert number == len(asked)
         asked.append(margins)
         return np.outer(np.linspace(0.5, 1.0, 20), 0.1 + 0.5 * margins)
 
@@ -75,11 +76,11 @@ def test_margins_cover_the_errors_of_plans_that_keep_them():
 
 def test_margins_that_never_cover_what_they_cause_are_refused():
     with pytest.raises(CdiffError, match=f"no margin found in {PASSES} passes: execution leaves the plans the further"):
-        until_covered(lambda margins: np.full((20, 1), 1.0) + 3 * margins, 1, level=0.9)
+        until_covered(lambda margins, _: np.full((20, 1), 1.0) + 3 * margins, 1, level=0.9)
 
 
 def test_where_execution_follows_the_plan_the_margin_is_nothing():
-    margins, _, passes = until_covered(lambda _: np.full((20, 1), -1.0), 1, level=0.9)
+    margins, _, passes = until_covered(lambda *_: np.full((20, 1), -1.0), 1, level=0.9)
     assert margins.tolist() == [0.0]
     assert passes == 1
 
