@@ -33,7 +33,7 @@ experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 2
 	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1
 	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 5
 
-margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour
+margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour or more
 	for c in hopper hopper-hard swimmer swimmer-hard; do for m in alm projected primal-dual safediffuser; do \
 		$(BIN)/cdiff $(CALIBRATE) --task $${c%-hard} --constraints constraints/$$c.yaml --method $$m || exit 1; done; done
 	for c in hopper swimmer; do for k in 2 4 8; do \

@@ -26,7 +26,7 @@ Match = Literal["exact", "other", "renumbered", "none", "given", "unused"]
 
 
 class Margin(Strict):
-    """Of one constraint: `margin` in the units of its barrier h; of what the episodes showed, the median and the largest."""
+    """Of one constraint: `margin` in the units of its barrier h; of the last pass's errors, the median and the largest."""
 
     margin: Annotated[float, Field(ge=0)]
     median: float
@@ -63,7 +63,8 @@ class Calibration(Strict):
 
     stem, content  of the constraint file, and the hash of what it said;  constraints  that in words, by name
     level          an episode that is exchangeable with those stays within the margins with at least this probability
-    episodes, seed number of calibration episodes, the first one's seed
+    episodes, seed number of calibration episodes of a pass, the first one's seed
+    passes         until margins covered what happens to plans that keep them
     """
 
     stem: str
@@ -72,6 +73,7 @@ class Calibration(Strict):
     conditions: Conditions
     level: Annotated[float, Field(gt=0, lt=1)]
     episodes: int
+    passes: int = 1
     seed: int
     weights_sha256: str
     margins: dict[str, Margin]

@@ -3,7 +3,7 @@
 import platform
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -13,16 +13,16 @@ import numpy as np
 from cdiff_cli import control_figures, metrics
 from cdiff_cli.baselines import BestOf
 from cdiff_cli.calibrations import Calibration, Margin, write_calibration
-from cdiff_cli.conditioning import content_sha256
 from cdiff_cli.control import Controller, control
 from cdiff_cli.episodes import Episodes
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.experiment import Finished, Tick
-from cdiff_cli.margins import conformal, errors, require_enough
+from cdiff_cli.margins import Array, excess, require_enough, tightened, until_covered
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.recipe import shown
 from cdiff_cli.request import Resolved
 from cdiff_cli.runs import Row, new_run, write_rows, write_yaml
+from cdiff_cli.spec import kinds_sha256
 from cdiff_cli.tasks import ControlTask
 from cdiff_cli.training import device_name, git_commit
 
@@ -60,31 +60,36 @@ def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Calib
 
 
 def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
-    """Act without a margin, and take those that cover how far execution left the plans."""
-    require_enough(resolved.options.n, level)
-    acting, checkpoint = controller(resolved), resolved.checkpoint
+    """Margins that cover how far execution leaves the plans that keep them; each pass acts on the next n seeds."""
+    n, checkpoint = resolved.options.n, resolved.checkpoint
+    require_enough(n, level)
+    acting = controller(resolved)
     assert checkpoint is not None
-    done = control(acting, resolved.seeds, parse_env(acting.task, resolved.options.env), on_step=lambda k, n: tick("control", k, n))
-    if done.diverged.any():
-        raise CdiffError(f"{_diverged(done)}: no margin covers that; nothing was written")
-    executed = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
-    scores = errors(done.foreseen, executed)
-    by_name = {
-        part.name: Margin(
-            margin=round(max(conformal(each, level), 0.0), 4), median=round(float(np.median(each)), 4), largest=round(each.max(), 4)
-        )
-        for part, each in zip(acting.g.parts, scores.T, strict=True)
-    }
+    env, names = parse_env(acting.task, resolved.options.env), [part.name for part in acting.g.parts]
+
+    def measured(margins: Array, number: int) -> Array:
+        seeds = [seed + number * n for seed in resolved.seeds]
+        inside = replace(acting, enforced=tightened(acting.enforced, dict(zip(names, margins.tolist(), strict=True))))
+        done = control(inside, seeds, env, on_step=lambda k, steps: tick("control", k, steps))
+        if done.diverged.any():
+            raise CdiffError(f"{_diverged(done)}: no margin covers that; nothing was written")
+        return excess(done.foreseen, metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt), margins)
+
+    margins, scores, passes = until_covered(measured, len(names), level)
     return Calibration(
         stem=resolved.constraints_path.stem,
-        content=content_sha256(resolved.kinds),
+        content=kinds_sha256(resolved.kinds),
         constraints={kind.name: kind.describe() for kind in resolved.kinds},
         conditions=resolved.conditions,
         level=level,
-        episodes=len(scores),
+        episodes=n,
+        passes=passes,
         seed=resolved.options.seed,
         weights_sha256=checkpoint.card.weights_sha256,
-        margins=by_name,
+        margins={
+            name: Margin(margin=round(margin, 4), median=round(float(np.median(each)), 4), largest=round(float(each.max()), 4))
+            for name, margin, each in zip(names, margins.tolist(), scores.T, strict=True)
+        },
     )
 
 
@@ -186,4 +191,4 @@ def _write(path: Path, resolved: Resolved, acting: Controller, done: Episodes, r
 def calibrated_text(path: Path, found: Calibration) -> str:
     """What `cdiff rollout --calibrate` prints."""
     each = "; ".join(f"{name} {m.margin:g} (median {m.median:g}, largest {m.largest:g})" for name, m in found.margins.items())
-    return f"margins at level {found.level:g} from {found.episodes} episodes: {each}\nwritten to {shown(path)}"
+    return f"margins at level {found.level:g} from {found.episodes} episodes, pass {found.passes}: {each}\nwritten to {shown(path)}"

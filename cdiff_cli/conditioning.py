@@ -1,7 +1,5 @@
 """Classifier-free conditioning on constraints: labels of training windows, what is observed beside them, the guided estimate."""
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from torch import Tensor, nn
 from cdiff_cli.constraint import Constraint, Traj
 from cdiff_cli.diffusion import Denoiser
 from cdiff_cli.observed import Observed, Seen
-from cdiff_cli.spec import load_constraints
+from cdiff_cli.spec import kinds_sha256, load_constraints
 
 Seeing = Callable[[Seen, Tensor], Denoiser]
 """(what is observed now, the present states [n, dim]) -> the clean estimate of a planner that is told of it."""
@@ -43,7 +41,7 @@ class Condition:
         observable = getattr(task, "observable", ())
         kinds, g = load_constraints(path, task.name, task.layout, None, observable, getattr(task, "dt", None))
         waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
-        return cls(path.stem, g, content_sha256(kinds), tuple(name for name in observable if name in waits))
+        return cls(path.stem, g, kinds_sha256(kinds), tuple(name for name in observable if name in waits))
 
     @property
     def entries(self) -> int:
@@ -92,12 +90,6 @@ def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """The labels with that share of them, drawn at random, replaced by zeros: no condition."""
     keep = torch.rand(len(label), 1, generator=generator) >= share
     return label * keep
-
-
-def content_sha256(kinds: Sequence[Any]) -> str:
-    """Hash of the constraints as read, so that a comment in their file changes nothing."""
-    said = [kind.model_dump(mode="json", exclude_none=True) for kind in kinds]
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def guided(net: nn.Module, weight: float, limit: float = 1.0, told: Tensor | None = None) -> Denoiser:

@@ -1,7 +1,7 @@
 """Margins from evidence: how far execution leaves the plan on the unsafe side, and the conformal quantile that covers it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,9 @@ from cdiff_cli.constraint import Constraint
 from cdiff_cli.errors import CdiffError
 
 Array = NDArray[np.float64]
+
+PASSES = 6  # of calibration at most
+FINEST = 1e-4  # margins are multiples of it, in the units of the barrier
 
 
 def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
@@ -29,6 +32,36 @@ def errors(foreseen: Array, executed: Array) -> Array:
     gap = np.nan_to_num((executed - foreseen)[:, 1:], nan=-np.inf)
     largest = gap.max((0, 1))
     return np.asarray(np.where(-foreseen[:, 1:] <= largest, gap, 0.0).max(1))
+
+
+def until_covered(measured: Callable[[Array, int], Array], parts: int, level: float) -> tuple[Array, Array, int]:
+    """Margins [parts] that cover the excess of plans that keep those same margins, that excess [n, parts], and the passes it took.
+    Plans that stay clear of a limit are other plans than those that ride it, so what covers the errors of the one need not cover
+    those of the other: each pass acts with the margins found so far, on episodes of its own, until they suffice. Where they do
+    not, they are raised by twice what is missing. The last pass fits nothing: it confirms. CdiffError where none does.
+
+    measured   margins and the number of the pass, from 0, to the excess() of new episodes
+    """
+    margins = np.zeros(parts)
+    for k in range(1, PASSES + 1):
+        scores = measured(margins, k - 1)
+        needed = np.array([conformal(each, level) for each in scores.T])
+        if (needed <= margins).all():
+            return margins, scores, k
+        short = np.maximum(needed - margins, 0.0) * (1 if k == 1 else 2)
+        margins = np.ceil((margins + short) / FINEST) * FINEST
+    raise CdiffError(
+        f"no margin found in {PASSES} passes: execution leaves the plans the further, the more clear of the limit they keep "
+        f"(the last margins tried: {', '.join(f'{margin:.3g}' for margin in margins)}); nothing was written"
+    )
+
+
+def excess(foreseen: Array, executed: Array, margins: Array) -> Array:
+    """Largest amount by which an episode of plans that keep the margins was less safe than they allow [n, parts]: than its plan, as
+    in errors(), or than the limit less the margin. The second is the larger where small errors of one step add up over many.
+    """
+    worst = np.nan_to_num(executed[:, 1:], nan=-np.inf).max(1)
+    return np.maximum(errors(foreseen, executed), np.where(worst > 0, worst + margins, 0.0))
 
 
 def conformal(scores: Array, level: float) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cdiff_cli.baselines import Conditional
 from cdiff_cli.calibrations import Chosen, Conditions, choose, read_calibrations
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.conditioning import Seeing, content_sha256, guided
+from cdiff_cli.conditioning import Seeing, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
@@ -25,7 +25,7 @@ from cdiff_cli.methods import METHODS, Unconstrained, make_method
 from cdiff_cli.planning import Problem, check_feasible, network_denoiser
 from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
-from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, load_constraints
+from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
 
@@ -276,7 +276,7 @@ def _margins(
     if not preset.margin or checkpoint is None or options.calibrate or isinstance(method, Unconstrained | Conditional):
         return Chosen({}, "unused")
     known = read_calibrations(checkpoint.path)
-    return choose(known, checkpoint.card.weights_sha256, path.stem, content_sha256(kinds), conditions)
+    return choose(known, checkpoint.card.weights_sha256, path.stem, kinds_sha256(kinds), conditions)
 
 
 def _require_applicable(options: Options, acts: bool) -> None:
@@ -307,7 +307,7 @@ def _conditional(kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | Non
     if not where.exists():
         raise CheckpointError(f"{where}: no conditional planner for these constraints; {advice}")
     found = load_checkpoint(where, task, next(checkpoint.net.parameters()).device)
-    if found.card.constraints != content_sha256(kinds):
+    if found.card.constraints != kinds_sha256(kinds):
         raise CheckpointError(f"{where}: trained for other constraints than {path} holds now; {advice} again")
     if (found.card.horizon, found.card.n_steps) != (checkpoint.card.horizon, checkpoint.card.n_steps):
         raise CheckpointError(f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again")

@@ -4,6 +4,8 @@ Environment units and coordinate names only. A further kind comes from another p
 `cdiff.constraints`: a Strict model with `kind`, `name`, `coordinates()` and `compile(layout)`.
 """
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -348,6 +350,12 @@ def enforced(kinds: Sequence[Kind], g: Constraint, safety: str) -> Constraint:
     wanted = [getattr(kind, "safety", None) or safety for kind in kinds]
     each = [part.on_segments() if want == "segments" else (part,) for part, want in zip(g.parts, wanted, strict=True)]
     return Constraint(tuple(part for parts in each for part in parts))
+
+
+def kinds_sha256(kinds: Sequence[Any]) -> str:
+    """Hash of the constraints as read, so that a comment in their file changes nothing."""
+    said = [kind.model_dump(mode="json", exclude_none=True) for kind in kinds]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def json_schema() -> dict[str, Any]:

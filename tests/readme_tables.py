@@ -70,6 +70,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "table2-swimmer": lambda: of_rows("table2-swimmer", CONTROL, paper=True),
     "table3": lambda: of_rows("table3", BALL, paper=True),
     "few-steps": lambda: of_rows("few-steps", FEW),
+    "fresh": lambda: of_rows("fresh", IN_BRIEF),
     "quality": lambda: of_rows("quality", QUALITY),
     "metrics": of_metrics,
 }

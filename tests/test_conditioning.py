@@ -5,7 +5,7 @@ import shutil
 import pytest
 import torch
 
-from cdiff_cli.conditioning import Condition, content_sha256, drop, guided
+from cdiff_cli.conditioning import Condition, drop, guided
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.experiment import _plan_both
@@ -14,7 +14,7 @@ from cdiff_cli.metrics import violation
 from cdiff_cli.networks import ResidualMlp, TemporalUnet
 from cdiff_cli.recipe import home
 from cdiff_cli.request import Options, resolve
-from cdiff_cli.spec import load_constraints
+from cdiff_cli.spec import kinds_sha256, load_constraints
 from tests.problems import generator, normal, num, vec
 from tests.test_training import TINY, fit, own_minari, same  # noqa: F401  own_minari keeps the user's datasets untouched
 
@@ -78,7 +78,7 @@ def test_the_hash_of_constraints_ignores_comments_and_sees_numbers(tmp_path):
     hashes = []
     for i, variant in enumerate((text, "# a comment\n" + text, text.replace("b: 1.0", "b: 1.1"))):
         (tmp_path / f"{i}.yaml").write_text(variant)
-        hashes.append(content_sha256(load_constraints(tmp_path / f"{i}.yaml", "maze2d-umaze", ("x", "y", "vx", "vy"))[0]))
+        hashes.append(kinds_sha256(load_constraints(tmp_path / f"{i}.yaml", "maze2d-umaze", ("x", "y", "vx", "vy"))[0]))
     assert hashes[0] == hashes[1] != hashes[2]
 
 

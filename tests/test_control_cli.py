@@ -165,12 +165,12 @@ def test_calibration_writes_margins_beside_the_checkpoint_and_rollouts_use_them(
     checkpoint = copied(tmp_path)
     words = (*BALL, "--checkpoint", checkpoint, "--episodes", 3, "--execute", 8)
     stdout = cdiff(*words, "--calibrate", "--level", 0.75, "--runs", tmp_path / "runs").stdout
-    assert "margins at level 0.75 from 3 episodes: moving-ball" in stdout
+    assert "margins at level 0.75 from 3 episodes, pass " in stdout
     (found,) = read_calibrations(checkpoint)
     assert (found.stem, found.level, found.episodes, found.seed) == ("ball-run", 0.75, 3, 0)
     assert (found.conditions.method, found.conditions.execute, found.conditions.settings["rho"]) == ("alm", 8, 10.0)
     margin = found.margins["moving-ball"]
-    assert margin.margin == max(margin.largest, 0.0)  # the third of three covers three in four
+    assert margin.margin >= max(margin.largest, 0.0)  # in the last pass: the third of three covers three in four
     assert not (tmp_path / "runs").exists()
     stdout = cdiff(*words, "--runs", tmp_path / "runs").stdout
     assert "note:" not in stdout
@@ -205,7 +205,7 @@ def test_calibration_as_json_names_its_file(tmp_path):
     words = ("--method", "diffuser", "--episodes", 1, "--execute", 15, "--calibrate", "--level", 0.5, "--json")
     said = json.loads(cdiff(*BALL, "--checkpoint", checkpoint, *words).stdout)
     assert said["file"] == str(tmp_path / "small.margins.yaml")
-    assert said["margins"]["moving-ball"]["largest"] >= said["margins"]["moving-ball"]["margin"] >= 0
+    assert said["margins"]["moving-ball"]["margin"] >= max(said["margins"]["moving-ball"]["largest"], 0)
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.95, 19), (0.99, 99), (0.9, 9), (0.75, 3)])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
-from cdiff_cli.margins import conformal, errors, require_enough, tightened
+from cdiff_cli.margins import PASSES, conformal, errors, excess, require_enough, tightened, until_covered
 from tests.problems import vec
 
 
@@ -55,3 +55,45 @@ def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
     parts = [Waypoints(name, Affine(vec(1.0), torch.tensor(3.0, dtype=torch.float64))) for name in ("near", "other")]
     g = tightened(Constraint(tuple(parts)), {"near": 0.25})
     np.testing.assert_allclose(g(torch.full((1, 1, 1), 2.9, dtype=torch.float64))[0], [0.15, -0.1])
+
+
+def test_margins_cover_the_errors_of_plans_that_keep_them():
+    """Errors of 0.1 without a margin and half a margin more with one: 0.1 itself would not do, the least that does is 0.2."""
+    asked = []
+
+    def measured(margins, number):
+        assert number == len(asked)
+        asked.append(margins)
+        return np.outer(np.linspace(0.5, 1.0, 20), 0.1 + 0.5 * margins)
+
+    margins, scores, passes = until_covered(measured, 2, level=0.9)
+    assert (scores <= margins).mean() >= 0.9
+    assert np.allclose(margins, 0.2, atol=0.02)
+    assert passes == len(asked) > 1
+    assert np.array_equal(asked[0], np.zeros(2))
+    assert np.array_equal(asked[-1], margins)
+
+
+def test_margins_that_never_cover_what_they_cause_are_refused():
+    with pytest.raises(CdiffError, match=f"no margin found in {PASSES} passes: execution leaves the plans the further"):
+        until_covered(lambda margins, _: np.full((20, 1), 1.0) + 3 * margins, 1, level=0.9)
+
+
+def test_where_execution_follows_the_plan_the_margin_is_nothing():
+    margins, _, passes = until_covered(lambda *_: np.full((20, 1), -1.0), 1, level=0.9)
+    assert margins.tolist() == [0.0]
+    assert passes == 1
+
+
+def test_excess_counts_what_small_errors_add_up_to():
+    """Each step ends 0.01 less safe than its plan, and three in a row pass the limit by 0.02, with a margin of 0.1."""
+    executed = np.array([[[-0.2], [0.0], [0.01], [0.02]]])
+    foreseen = executed - 0.01
+    assert errors(foreseen, executed) == pytest.approx(0.01)
+    assert excess(foreseen, executed, np.array([0.1])) == pytest.approx(0.12)
+
+
+def test_excess_of_a_safe_episode_is_its_error():
+    executed = np.array([[[-0.2], [-0.05], [-0.02], [np.nan]]])
+    foreseen = np.array([[[-0.2], [-0.15], [-0.03], [np.nan]]])
+    assert excess(foreseen, executed, np.array([0.3])) == pytest.approx(errors(foreseen, executed))
