@@ -6,16 +6,14 @@ import torch
 
 from cdiff_cli.constraint import Constraint, Traj
 from cdiff_cli.diffusion import Step
-from cdiff_cli.dynamics import DYNAMICS_FROM, due, split
-from cdiff_cli.projection import ADMM_ROUNDS, project_from
-from cdiff_cli.reaching import Warm
+from cdiff_cli.projection import project
 
 
 @dataclass(frozen=True)
 class Guidance:
     """x_{t-1} = reverse(x0) - weight sum dg(x_t): a push of constant weight along every row's gradient, violated or not.
 
-    The released maze code calls it conditional; the paper's text means `conditional`, trained. Dynamics are left to the polish.
+    The released maze code calls it conditional; the paper's text means `conditional`, trained.
 
     weight   5.5e-3 as released
     """
@@ -26,7 +24,7 @@ class Guidance:
         return None
 
     def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
-        rows, pull, _ = split(g)[0].linearise(step.x)
+        rows, pull, _ = g.linearise(step.x)
         return step.reverse(step.x0) - self.weight * step.pins.free(pull(torch.ones_like(rows))), None
 
 
@@ -51,19 +49,14 @@ class Conditional:
 class Terminal:
     """Only the trajectory that sampling ends at is asked to obey, as DiRecT does (Giaretta et al., 2026): the clean estimate is
     projected and the sample follows by the whole displacement, x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0).
-
-    rounds, dynamics_from   as in Projected
     """
 
-    rounds: int = 30
-    dynamics_from: float = DYNAMICS_FROM
-
-    def init(self, x: Traj, g: Constraint) -> Warm | None:
+    def init(self, x: Traj, g: Constraint) -> None:
         return None
 
-    def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
-        x0, state = project_from(due(g, step.level, self.dynamics_from), step.x0, step.pins, state, self.rounds)
-        return step.reverse(step.x0) + step.level * (x0 - step.x0), state
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        x0 = project(g, step.x0, step.pins, strict=False)
+        return step.reverse(step.x0) + step.level * (x0 - step.x0), None
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ class FinalProjection:
 
     def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
         x = step.reverse(step.x0)
-        return (project_from(g, x, step.pins, None, ADMM_ROUNDS)[0] if step.last else x), None
+        return (project(g, x, step.pins, strict=False) if step.last else x), None
 
 
 @dataclass(frozen=True)

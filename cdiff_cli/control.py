@@ -25,7 +25,7 @@ from cdiff_cli.methods import AlmState, Unconstrained
 from cdiff_cli.networks import InverseDynamics
 from cdiff_cli.observed import Seen
 from cdiff_cli.planning import MARGIN, Timed, candidate_seed, synchronise
-from cdiff_cli.projection import project_from
+from cdiff_cli.projection import project
 from cdiff_cli.tasks import ControlTask
 
 Array = NDArray[np.float64]
@@ -326,7 +326,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         inside = obeyed if controller.condensed is None else replace(obeyed, condensed=controller.condensed)
         if controller.polish and bool((inside(to.centre + y64) > -MARGIN).any()):
             g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
-            y64, _ = project_from(g64, y64, Pins(mask.cpu(), begin), None, 0)
+            y64 = project(g64, y64, Pins(mask.cpu(), begin), strict=False)
         x = (to.centre + y64).numpy()
         x[:, 0] = states
         missed = np.zeros(len(x), dtype=bool)

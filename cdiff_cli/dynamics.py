@@ -17,7 +17,6 @@ from cdiff_cli.constraint import Constraint, Part, Pull, Rows, Traj
 from cdiff_cli.levels import each_end, take
 
 Array = NDArray[np.float64]
-DYNAMICS_FROM = 0.995
 """Of 0, 0.9, 0.95 and 0.995 the one with the smallest distance, all as safe when executed: alm on maze2d-umaze-disc and -slalom,
 100 random pairs, seed 2000.
 """
@@ -150,11 +149,6 @@ def split(g: Constraint) -> tuple[Constraint, Constraint]:
     if not found:
         return g, Constraint(())
     return Constraint(tuple(part for part in g.parts if part not in found)), Constraint(tuple(found))
-
-
-def due(g: Constraint, level: float, dynamics_from: float) -> Constraint:
-    """g, without its dynamics while the sample is still too noisy for them: level = sqrt(alpha_bar_{t-1}) below dynamics_from."""
-    return g if level >= dynamics_from else split(g)[0]
 
 
 def fit(x: Array, u: Array, after: Array) -> tuple[LinearDynamics, float]:

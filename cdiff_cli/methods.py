@@ -23,10 +23,8 @@ from torch.nn import functional as F
 from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
 from cdiff_cli.constraint import Constraint, Pins, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.dynamics import DYNAMICS_FROM, due, dynamics_of, split
 from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.projection import project_from
-from cdiff_cli.reaching import Warm
+from cdiff_cli.projection import project
 from cdiff_cli.safediffuser import SafeDiffuser
 from cdiff_cli.segments import Turned, apart, crossed, turned
 
@@ -53,28 +51,23 @@ class Unconstrained:
 class Projected:
     """x_{t-1} = P_C(reverse(x0)) on noisy (paper, section 4.1); reverse(P_C(x0)) on clean.
 
-    correction     on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
-                   x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
-    rounds         for dynamics (projection.py): a choice of tangent planes for each ten, of ADMM where that is needed
-    dynamics_from  they are obeyed once sqrt(alpha_bar_{t-1}) is at least this
+    correction   on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
+                 x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
     """
 
     on: On = "clean"
     correction: Correction = "kernel"
-    rounds: int = 30
-    dynamics_from: float = DYNAMICS_FROM
 
-    def init(self, x: Traj, g: Constraint) -> Warm | None:
+    def init(self, x: Traj, g: Constraint) -> None:
         return None
 
-    def step(self, step: Step, g: Constraint, state: Warm | None) -> tuple[Traj, Warm | None]:
-        g = due(g, step.level, self.dynamics_from)
-        if self.on == "clean":
-            x0, state = project_from(g, step.x0, step.pins, state, self.rounds)
-            if self.correction == "kernel":
-                return step.reverse(x0), state
-            return step.reverse(step.x0) + step.level * (x0 - step.x0), state
-        return project_from(g, step.reverse(step.x0), step.pins, state, self.rounds)
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        if self.on == "noisy":
+            return project(g, step.reverse(step.x0), step.pins, strict=False), None
+        x0 = project(g, step.x0, step.pins, strict=False)
+        if self.correction == "kernel":
+            return step.reverse(x0), None
+        return step.reverse(step.x0) + step.level * (x0 - step.x0), None
 
 
 @dataclass(frozen=True)
@@ -86,13 +79,8 @@ class PrimalDual:
     estimate:  the same with g and dg at x0
     clean:  x0' = x0 - lam_t^T dg(x0),  x_{t-1} = reverse(x0'),  lam_{t-1} = [lam_t + eta E g(x0') / |dg|^2]_+
 
-    With dynamics among the constraints, `clean` keeps no multipliers for them: x0' is projected onto the dynamics alone, and the
-    multipliers climb `rounds` times a step, each time to where that projection ends. Once a step is too seldom: what the dynamics
-    let move moves less than the push asks, and multipliers that trail leave to the polish what the network should see.
-
     eta          dual step; on clean in units of the exact one (1 solves one half-space in a step)
     coefficient  c_t on noisy: beta_t / 2 (the paper) or one (its released code)
-    rounds, dynamics_from   where dynamics are to be obeyed: climbs a step; as in Projected
     expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
@@ -102,11 +90,9 @@ class PrimalDual:
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
-    rounds: int = 10
-    dynamics_from: float = DYNAMICS_FROM
 
     def init(self, x: Traj, g: Constraint) -> Rows:
-        return zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation, self.on != "noisy")
+        return zeros(x, g, self.expectation, self.on != "noisy")
 
     def step(self, step: Step, g: Constraint, state: Rows) -> tuple[Traj, Rows]:
         lam = state
@@ -118,23 +104,19 @@ class PrimalDual:
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
-        g, dynamics = split(due(g, step.level, self.dynamics_from))
-        flat, x0, warm = turned(g, step.x0, step.pins), step.x0, None
-        rows, pull, _ = linearise(flat, x0, self.positive)
-        for _ in range(self.rounds if dynamics.parts else 1):
-            x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
-            x0, warm = project_from(dynamics, x0, step.pins, warm, 1)
-            rows, _, size = linearise(flat, x0, self.positive)
-            lam = (lam + self.eta * expect(rows / size.clamp_min(1e-12), self.expectation)).clamp_min(0)
+        flat = turned(g, step.x0, step.pins)
+        rows, pull, _ = linearise(flat, step.x0, self.positive)
+        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        rows, _, size = linearise(flat, x0, self.positive)
+        lam = (lam + self.eta * expect(rows / size.clamp_min(1e-12), self.expectation)).clamp_min(0)
         return step.reverse(x0), lam
 
 
 class AlmState(NamedTuple):
-    """Multipliers [batch or 1, n] and the penalty weight; where dynamics are obeyed, where their projection ended."""
+    """Multipliers [batch or 1, n] and the penalty weight."""
 
     lam: Rows
     rho: float
-    warm: Warm | None = None
 
 
 @dataclass(frozen=True)
@@ -148,12 +130,8 @@ class AugmentedLagrangian:
             x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
     lam_{t-1} = m,  rho_{t-1} = c rho_t
 
-    With dynamics among the constraints, `clean` maximises over the multipliers instead of climbing: the exact projection
-    (reaching.py), which starts from the rows that were active a step before.
-
     rho          first penalty weight; on clean in units of the exact one, kept at most 1, where one half-space is met at once
     c            its growth a step
-    rounds, dynamics_from   as in Projected
     inner        rounds a step on clean: 1 is exact where each row moves its own waypoint, coupled rows need more
     coefficient, expectation, positive   as in PrimalDual
     """
@@ -162,17 +140,15 @@ class AugmentedLagrangian:
     rho: float = 0.5
     c: float = 1.02
     inner: int = 1
-    rounds: int = 10
-    dynamics_from: float = DYNAMICS_FROM
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
 
     def init(self, x: Traj, g: Constraint) -> AlmState:
-        return AlmState(zeros(x, split(g)[0] if self.on == "clean" else g, self.expectation, self.on != "noisy"), self.rho)
+        return AlmState(zeros(x, g, self.expectation, self.on != "noisy"), self.rho)
 
     def step(self, step: Step, g: Constraint, state: AlmState) -> tuple[Traj, AlmState]:
-        lam, rho, _ = state
+        lam, rho = state
         if self.on != "noisy" and idle(g, step, lam):
             return step.reverse(step.x0), state._replace(rho=self._grown(rho))
         if self.on != "clean":
@@ -181,10 +157,6 @@ class AugmentedLagrangian:
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(m, self._grown(rho))
-        g = due(g, step.level, self.dynamics_from)
-        if dynamics_of(g):
-            x0, warm = project_from(g, step.x0, step.pins, state.warm, self.rounds)
-            return step.reverse(x0), AlmState(lam, rho, warm)
         flat = turned(g, step.x0, step.pins)
         rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
@@ -248,7 +220,7 @@ def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
 
 def idle(g: Constraint, step: Step, lam: Rows) -> bool:
     """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
-    if dynamics_of(g) or _positive(lam):
+    if _positive(lam):
         return False
     round_, others = apart(g)
     if round_ and bool(crossed(round_, step.x0).any()):

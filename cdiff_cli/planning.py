@@ -17,7 +17,7 @@ from cdiff_cli.dynamics import Reachable, dynamics_of, split
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.observed import require_bound
-from cdiff_cli.projection import ADMM_ROUNDS, project, project_from
+from cdiff_cli.projection import project, project_reachable
 from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
@@ -124,7 +124,8 @@ def plan(
     device, dim = problem.device, len(problem.task.layout)
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
-    inside = _tighten_others(problem.enforced, CLEARANCE) if dynamics_of(problem.enforced) else problem.enforced
+    others, dynamics = split(problem.enforced)
+    inside = others.tighten(CLEARANCE) if dynamics.parts else others
     g, scored = (pull_back(constraint, centre, scale).to(like) for constraint in (inside, problem.g))
     pins = make_pins(problem, len(seeds))
     shape = (problem.horizon, dim)
@@ -157,7 +158,7 @@ def plan(
             )
         z64 = z.double().cpu()
         moved, u = np.zeros(len(seeds)), None
-        if polish and not isinstance(method, Unconstrained):
+        if (polish or dynamics.parts) and not isinstance(method, Unconstrained):
             z64, moved, u = polish_plans(problem, z64)
         x = problem.normaliser.decode(z64).numpy()
     synchronise(device)
@@ -236,8 +237,7 @@ def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array
         g = pull_back(_tighten_others(problem.enforced, clearance), scale.centre, scale.scale).take(todo)
         pinned = pins.values[todo]
         warm = warm if clearance == CLEARANCE else None
-        near, warm = project_from(g, z[todo], Pins(pins.mask, pinned), warm, ADMM_ROUNDS, tolerance)
-        assert warm is not None
+        near, warm = project_reachable(g, z[todo], Pins(pins.mask, pinned), warm, tolerance)
         made = torch.clamp(warm.u, dynamics.low, dynamics.high)
         path = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), made))
         missed = (scale.scale * torch.where(pins.mask, path - pinned, 0.0)).abs().amax((1, 2)) > 1e-3

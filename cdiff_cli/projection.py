@@ -25,7 +25,7 @@ from cdiff_cli.approach import Approach
 from cdiff_cli.chains import nearest_on_chain
 from cdiff_cli.closed_forms import nearest
 from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, Traj, Waypoints
-from cdiff_cli.dynamics import Reachable, dynamics_of, split
+from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
 from cdiff_cli.rates import Rate, Slowed
@@ -33,45 +33,31 @@ from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
-ADMM_ROUNDS = 600  # of ADMM at most, where no number is given
+ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (reaching.py)
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 FINER = 30  # what ADMM asks of a projection within it, over its own tolerance
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
-def project(g: Constraint, z: Traj, pins: Pins) -> Traj:
+def project(g: Constraint, z: Traj, pins: Pins, *, strict: bool = True) -> Traj:
     """The trajectory nearest to z [batch, horizon, dim] that satisfies g and the pins.
 
-    Convex parts with a closed form: the global nearest point. Non-convex intersections: a feasible local one. Raises
-    InfeasibleError, naming rows, where none was found.
+    Convex parts with a closed form: the global nearest point. Non-convex intersections: a feasible local one.
+
+    strict   raise InfeasibleError, naming rows, where nothing feasible was found; otherwise, as within sampling, where the next
+             estimate may be easier, return the best point that the tangent planes of segments gave
     """
-    return project_from(g, z, pins, None, ADMM_ROUNDS, 1e-6, strict=True)[0]
+    return project_reachable(g, z, pins)[0] if dynamics_of(g) else _project(g, z, pins, strict)
 
 
-def project_from(
-    g: Constraint, z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float = 1e-3, strict: bool = False
-) -> tuple[Traj, Warm | None]:
-    """The same, where dynamics are to be obeyed to the tolerance (units of the inputs, and environment units), from where the last
-    call ended, the tangent planes chosen once for ten rounds, at most REFINEMENTS times.
-
-    rounds   of ADMM at most, where one of the parts is met with dynamics by its projection alone (reaching.py)
-
-    strict   raise where nothing feasible was found; otherwise, as within sampling, where the next estimate may be easier, return
-             the best point that the tangent planes of segments gave
+def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = None, tolerance: float = 1e-6) -> tuple[Traj, Warm]:
+    """The same for a g with dynamics: obeyed exactly, the other parts to the tolerance (environment units), from where an earlier
+    call ended. In float64 within, the other parts on the coordinates that they constrain alone.
     """
-    reachable = dynamics_of(g)
-    if not reachable:
-        return _project(g, z, pins, strict), None
+    reachable, others = dynamics_of(g), split(g)[0].parts
     if len(reachable) > 1:
         raise InfeasibleError(f'two sets of dynamics, "{reachable[0].name}" and "{reachable[1].name}": a plan can obey only one')
-    return _reach(reachable[0], split(g)[0].parts, pins.paint(z), pins, warm, rounds, tolerance)
-
-
-def _reach(
-    part: Reachable, others: Sequence[Part], z: Traj, pins: Pins, warm: Warm | None, rounds: int, tolerance: float
-) -> tuple[Traj, Warm | None]:
-    """In environment units, in float64, the other parts on the coordinates that they constrain alone."""
-    kind, z, part = z, z.double(), part.to(z.double())
+    kind, z, part = z, pins.paint(z).double(), reachable[0].to(z.double())
     back = (-part.centre / part.scale, 1 / part.scale)
     used = _coordinates(others, z.shape[-1])
     narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
@@ -85,8 +71,8 @@ def _reach(
         Pins(pins.mask, part.decode(pins.values.to(z))),
         used=used,
         weight=part.weight,
-        rounds=rounds,
-        turns=max(1, min(REFINEMENTS, rounds // 10)),
+        rounds=ADMM_ROUNDS,
+        turns=REFINEMENTS,
         warm=warm,
         tolerance=tolerance,
     )

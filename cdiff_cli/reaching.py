@@ -31,7 +31,7 @@ PIVOTS, PATIENCE = 200, 12  # changes of the active set at most; those without f
 CONTRADICTED = 1e-3  # violation of active rows that all push from which they turn soft, and up to which soft ones turn hard again
 SOFTLY, AGAIN = 30, 2  # changes of the active set of a plan at most once it is soft; where it was soft before
 RUN = 8  # waypoints on either side among which one half-space enters at once, the one that is violated most
-RHO, RELAXATION = 5.0, 1.6  # of ADMM, for what has a projection but no rows
+RHO, RELAXATION = 50.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
 
 

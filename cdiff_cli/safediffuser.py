@@ -21,7 +21,6 @@ from torch import Tensor
 
 from cdiff_cli.constraint import Chain, Constraint, Part, Segments, Traj, Waypoints
 from cdiff_cli.diffusion import Step
-from cdiff_cli.dynamics import split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.rates import Rate
 
@@ -58,7 +57,6 @@ class SafeDiffuser:
         return None
 
     def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
-        g, _ = split(g)
         asked = step.reverse(step.x0)
         if not g.parts:
             return asked, None

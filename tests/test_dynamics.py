@@ -14,7 +14,7 @@ from cdiff_cli.dynamics import LinearDynamics, Reachable, dynamics_of, fit, spli
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.planning import CLEARANCE
-from cdiff_cli.projection import project, project_from
+from cdiff_cli.projection import project, project_reachable
 from cdiff_cli.rates import Rate, limits
 from cdiff_cli.reaching import nearest_reachable
 from tests.problems import F64, ball, normal, num, pin, saddle, vec
@@ -304,9 +304,9 @@ def test_a_disc_on_the_way_is_avoided_on_segments_within_the_inputs(dtype):
     assert float(disc(z).max()) > 0.05
     g = Constraint((reachable(maze(), weight=WEIGHT), disc)).to(z.to(dtype))
     z = z.to(dtype)
-    x, warm = project_from(g, z, pin(z, 0, 63), None, 2000)
+    x, warm = project_reachable(g, z, pin(z, 0, 63), None, 1e-3)
     assert x.dtype == dtype
-    tolerance = 1e-4 if dtype == F64 else 1e-3  # where ADMM stops; 2e-5 was measured in float64
+    tolerance = 1e-4 if dtype == F64 else 1e-3  # where the active set stops; 2e-5 was measured in float64
     assert float(disc(x.double()).max()) <= tolerance
     assert float(warm.u.abs().max()) <= 1 + tolerance
     torch.testing.assert_close(x[:, [0, 63]], z[:, [0, 63]], atol=tolerance, rtol=0)
@@ -333,7 +333,7 @@ def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
     z = trip()
     z[:, -1, 0] = 20.0
     g = Constraint((reachable(maze(), weight=WEIGHT),))
-    x, warm = project_from(g, z, pin(z, 0, 63), None, 600)
+    x, warm = project_reachable(g, z, pin(z, 0, 63), None, 1e-3)
     assert bool(torch.isfinite(x).all())
     assert float(warm.u.abs().max()) > 1.5  # what the goal would take
     assert float(g(x).max()) > 0.05  # and g says so
@@ -354,7 +354,7 @@ def test_chains_and_quadrics_beside_dynamics_are_obeyed(other):
     z = trip()
     g = Constraint((reachable(maze(), weight=WEIGHT), other))
     assert float(other(z).max()) > 1e-3
-    x, warm = project_from(g, z, pin(z, 0), None, 300)
+    x, warm = project_reachable(g, z, pin(z, 0), None, 1e-3)
     assert float(other(x).max()) <= CLEARANCE  # which a polish leaves
     assert float(warm.u.abs().max()) <= 1 + CLEARANCE
     torch.testing.assert_close(x[:, 0], z[:, 0], atol=1e-12, rtol=0)
@@ -370,7 +370,7 @@ def test_a_chain_a_disc_and_a_wall_hold_at_once():
             Chain("slow", Affine(vec(0.0, 0.0, 1.0, 0.0), num(2.3)), 0.3),
         )
     )
-    x, _ = project_from(g, z, pin(z, 0, 63), None, 1000)
+    x, _ = project_reachable(g, z, pin(z, 0, 63), None, 1e-3)
     assert float(g(x).max()) <= 1e-3  # no closed form holds them all at once, and ADMM has not ended
 
 
@@ -381,7 +381,7 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
     slow = Rate("slow", torch.eye(4, dtype=F64)[:2], *limits(None, 2.3), True, 0.01, torch.zeros_like(one), one)
     g = Constraint((reachable(maze(), weight=WEIGHT), slow, Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))))
     assert float(slow(z).max()) > 0.3
-    x, warm = project_from(g, z, pin(z, 0, 63), None, 600, 5e-5)
+    x, warm = project_reachable(g, z, pin(z, 0, 63), None, 5e-5)
     assert float(slow(x).max()) <= 2 * 5e-5 / 0.01  # m/s: both ends of a segment within the tolerance, over dt
     assert float(g.parts[2](x).max()) <= 5e-5
     assert float(warm.u.abs().max()) <= 1 + 5e-5

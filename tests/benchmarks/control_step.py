@@ -23,7 +23,7 @@ from scipy import sparse
 from cdiff_cli.closed_loop import controller
 from cdiff_cli.constraint import Pins, pull_back
 from cdiff_cli.control import Controller, control
-from cdiff_cli.projection import project_from
+from cdiff_cli.projection import project
 from cdiff_cli.request import Options, resolve
 
 WARM_UP = 10
@@ -54,7 +54,7 @@ def projections(acting: Controller) -> tuple[float, float, float]:
     mask = torch.zeros(acting.horizon, dim, dtype=torch.bool)
     mask[0] = True
     pins = Pins(mask, y)
-    ours, _ = project_from(g, y, pins, None, 0)
+    ours = project(g, y, pins, strict=False)
     rows, pull, _ = g.linearise(ours)
     jacobian = torch.stack([pull(w[None])[0] for w in torch.eye(rows.shape[1], dtype=torch.float64)]).flatten(1).numpy()[:, dim:]
     bound = jacobian @ ours.flatten()[dim:].numpy() - rows[0].numpy()
@@ -64,7 +64,7 @@ def projections(acting: Controller) -> tuple[float, float, float]:
         return qpsolvers.solve_qp(eye, target, J, bound, solver="proxqp", eps_abs=1e-9)
 
     gap = float(np.abs(proxqp() - ours.flatten()[dim:].numpy()).max())
-    return median_ms(lambda: project_from(g, y, pins, None, 0)), median_ms(proxqp), gap
+    return median_ms(lambda: project(g, y, pins, strict=False)), median_ms(proxqp), gap
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from cdiff_cli.constraint import Chain, Constraint, Pins, pull_back
 from cdiff_cli.levels import Affine
-from cdiff_cli.projection import project_from
+from cdiff_cli.projection import project
 from cdiff_cli.spec import Dcbf
 
 LAYOUT = ("x", "y", "vx", "vy")
@@ -90,7 +90,7 @@ with torch.inference_mode():
             cells[case] = [
                 microseconds(lambda now=now, seen=seen: now.bind(seen, dt, horizon)),
                 microseconds(lambda bound=bound: pull_back(bound, centre, scale).to(z)),
-                microseconds(lambda back=back: project_from(back, z, pins, None, 10)),
+                microseconds(lambda back=back: project(back, z, pins, strict=False)),
                 microseconds(lambda back=back, rows=rows: back.linearise(z)[1](rows)),
             ]
         bind, pulled, active, linear = cells["active"]

@@ -16,7 +16,7 @@ from timing import milliseconds
 
 from cdiff_cli.constraint import Pins, pull_back
 from cdiff_cli.dynamics import split
-from cdiff_cli.projection import project_from
+from cdiff_cli.projection import project, project_reachable
 from cdiff_cli.request import Options, resolve
 
 CONSTRAINTS = Path(__file__).parents[2] / "constraints"
@@ -39,13 +39,13 @@ def measure(task: str, batch: int, repeats: int) -> list[str]:
     whole = pull_back(problem.enforced, *back).to(z)
     waypoints, segments = pull_back(problem.g, *back).to(z), split(whole)[0]
     with torch.inference_mode():
-        warm = project_from(whole, z, pins, None, 10)[1]
+        warm = project_reachable(whole, z, pins, None, 5e-4)[1]
         network = milliseconds(lambda: problem.denoiser(z, 10), repeats)
         parts = [
-            milliseconds(lambda: project_from(waypoints, z, pins, None, 0), repeats),
-            milliseconds(lambda: project_from(segments, z, pins, None, 0), repeats),
-            milliseconds(lambda: project_from(whole, z, pins, None, 10), repeats),
-            milliseconds(lambda: project_from(whole, z, pins, warm, 10), repeats),
+            milliseconds(lambda: project(waypoints, z, pins, strict=False), repeats),
+            milliseconds(lambda: project(segments, z, pins, strict=False), repeats),
+            milliseconds(lambda: project_reachable(whole, z, pins, None, 5e-4), repeats),
+            milliseconds(lambda: project_reachable(whole, z, pins, warm, 5e-4), repeats),
         ]
     cells = [text for ms in parts for text in (f"{ms:.2f}", f"{100 * ms / network:.0f}")]
     return [str(batch), f"{network:.1f}", *cells]
