@@ -40,7 +40,7 @@ EXACT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class SafeDiffuser:
-    """Barrier rows on each reverse step. Dynamics among the constraints are left to the polish.
+    """Barrier rows on each reverse step.
 
     variant   ros: robust-safe, res: relaxed-safe, tvs: time-varying-safe
     solver    closed-form: the exact active set, the whole batch at once; proxqp: one QP after another, as qpsolvers solves them

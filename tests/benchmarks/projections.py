@@ -1,9 +1,9 @@
-"""The projections of one diffusion step against the network call they accompany. One run; solvers are compared in reaching.py.
+"""The projections of one diffusion step against the network call they accompany. One run.
 
     python tests/benchmarks/projections.py [--task maze2d-umaze] [--batches 1,10,256] [--repeats 9] [--threads 2]
 
 Trajectories are the shipped demonstrations around the task's disc; ours is the median over the repeats after a warm-up, of the
-whole batch. With dynamics: from nothing, and from where the same projection ended.
+whole batch. With dynamics, once a plan, see reaching.py.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from timing import milliseconds
 
 from cdiff_cli.constraint import Pins, pull_back
 from cdiff_cli.dynamics import split
-from cdiff_cli.projection import project, project_reachable
+from cdiff_cli.projection import project
 from cdiff_cli.request import Options, resolve
 
 CONSTRAINTS = Path(__file__).parents[2] / "constraints"
@@ -36,16 +36,12 @@ def measure(task: str, batch: int, repeats: int) -> list[str]:
     mask[[0, -1]] = True
     pins = Pins(mask, z)
     back = (problem.normaliser.centre, problem.normaliser.scale)
-    whole = pull_back(problem.enforced, *back).to(z)
-    waypoints, segments = pull_back(problem.g, *back).to(z), split(whole)[0]
+    waypoints, segments = (pull_back(g, *back).to(z) for g in (problem.g, split(problem.enforced)[0]))
     with torch.inference_mode():
-        warm = project_reachable(whole, z, pins, None, 5e-4)[1]
         network = milliseconds(lambda: problem.denoiser(z, 10), repeats)
         parts = [
             milliseconds(lambda: project(waypoints, z, pins, strict=False), repeats),
             milliseconds(lambda: project(segments, z, pins, strict=False), repeats),
-            milliseconds(lambda: project_reachable(whole, z, pins, None, 5e-4), repeats),
-            milliseconds(lambda: project_reachable(whole, z, pins, warm, 5e-4), repeats),
         ]
     cells = [text for ms in parts for text in (f"{ms:.2f}", f"{100 * ms / network:.0f}")]
     return [str(batch), f"{network:.1f}", *cells]
@@ -60,7 +56,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     table = Table(title=f"{arguments.task}: milliseconds, % of the network call")
-    for head in ("batch", "network", "waypoints", "%", "segments", "%", "dynamics", "%", "dynamics, warm", "%"):
+    for head in ("batch", "network", "waypoints", "%", "segments", "%"):
         table.add_column(head, justify="right")
     for batch in map(int, arguments.batches.split(",")):
         table.add_row(*measure(arguments.task, batch, arguments.repeats))
