@@ -28,7 +28,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.rates import Rate, Slowed
+from cdiff_cli.rates import Rate, Slowed, independent
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
@@ -81,8 +81,9 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
 
 def _rest(parts: Sequence[Part], tolerance: float) -> Callable[[Traj, Pins], Traj] | None:
     """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
-    if len(parts) == 1 and isinstance(parts[0], Rate):
-        slowed = Slowed(parts[0], Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
+    rates = [part for part in parts if isinstance(part, Rate)]
+    if rates and len(rates) == len(parts) and independent(rates):
+        slowed = Slowed(rates, Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
 
         def slow(p: Traj, held: Pins) -> Traj:
             slowed.pins = held
@@ -137,7 +138,9 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     begin = z
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
-        onto += [Slowed(part, pins) if isinstance(part, Rate) else partial(exact, part, pins=pins) for part in others]
+        rates = [part for part in others if isinstance(part, Rate)]
+        onto += [Slowed(each, pins) for each in ([rates] if independent(rates) else [[part] for part in rates]) if each]
+        onto += [partial(exact, part, pins=pins) for part in others if not isinstance(part, Rate)]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
             return x  # one exact form misses only what is pinned behind what it moves
@@ -196,7 +199,7 @@ def exact(part: Part, z: Traj, pins: Pins) -> Traj:
     if isinstance(part, Waypoints):
         return pins.paint(nearest(part.level, z))
     if isinstance(part, Rate):
-        return Slowed(part, pins)(z)
+        return Slowed([part], pins)(z)
     assert isinstance(part, Chain)
     return pins.paint(nearest_on_chain(part, z, pins))
 

@@ -6,7 +6,8 @@ that depends on the pins, the weights and the horizon alone finds the trajectory
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import ClassVar
@@ -133,21 +134,27 @@ class Rate:
 
 @dataclass
 class Slowed:
-    """The projection onto one limit with the same pins, again and again: each call begins where the last one ended.
+    """The projection onto limits of which no two share a coordinate, with the same pins, again and again: each call begins where
+    the last one ended.
 
     close  how near the copies are to the differences in the end, environment units; None: 1e-10, in float32 1e-6
-    warm   copies of the differences and their scaled multipliers   [k, horizon - 1, batch]
+    warm   of each part that was not obeyed: copies of the differences and their scaled multipliers   [k, horizon - 1, batch]
     """
 
-    part: Rate
+    parts: Sequence[Rate]
     pins: Pins
     close: float | None = None
-    warm: tuple[Tensor, Tensor] | None = None
+    warm: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def __call__(self, z: Traj) -> Traj:
-        """The nearest trajectory to z within the limit."""
-        part, (batch, horizon, _) = self.part, z.shape
-        if horizon < 2 or (self.warm is None and not bool((part(z) > 0).any())):
+        """The nearest trajectory to z within the limits."""
+        for i, part in enumerate(self.parts):
+            z = self._onto(i, part, z)
+        return z
+
+    def _onto(self, i: int, part: Rate, z: Traj) -> Traj:
+        batch, horizon, _ = z.shape
+        if horizon < 2 or (i not in self.warm and not bool((part(z) > 0).any())):
             return z
         scale = part.scale @ part.which.T
         if scale.ndim == 3 and len(scale) > 1:
@@ -159,7 +166,7 @@ class Slowed:
         base = torch.where(held[..., None], target, 0.0)
         still, toward = base.diff(dim=1), base + fixed @ (weight[..., None] * target)
         step = target.diff(dim=1)
-        copy, dual = self.warm or (part.cut(step), torch.zeros_like(step))
+        copy, dual = self.warm.get(i) or (part.cut(step), torch.zeros_like(step))
         close, x = self.close or (1e-10 if z.dtype == torch.float64 else 1e-6), target
         for k in range(ROUNDS):
             x = toward + M @ (copy - dual - still)
@@ -169,14 +176,14 @@ class Slowed:
             dual = over - copy
             if k % 5 == 4 and max(float((made - copy).abs().max()), float((copy - before).abs().max())) < close:
                 break
-        self.warm = copy, dual
+        self.warm[i] = copy, dual
         return z + ((x - target).permute(2, 1, 0) / scale) @ part.which
 
 
 def _alone(part: Rate, pins: Pins, z: Traj, b: int) -> Traj:
     """The projection of one plan of a batch whose frames differ."""
     which = torch.tensor([b], device=z.device)
-    return Slowed(part.take(which), Pins(pins.mask, pins.values[which]))(z[which])
+    return Slowed([part.take(which)], Pins(pins.mask, pins.values[which]))(z[which])
 
 
 @lru_cache(maxsize=16)
@@ -197,6 +204,12 @@ def _solver(
         A = rho * D.T @ D + w[c].diag()
         inverse[c, free[:, None], free] = torch.linalg.inv(A[free[:, None], free])
     return inverse.to(device, dtype), (rho * inverse @ D.T).to(device, dtype)
+
+
+def independent(parts: Sequence[Rate]) -> bool:
+    """Whether no two of them limit the same coordinate: their projections, one after another, are then that onto all."""
+    limited = [name for part in parts for name in (part.which != 0).any(0).nonzero()[:, 0].tolist()]
+    return len(limited) == len(set(limited))
 
 
 def limits(low: float | None, high: float | None) -> tuple[float, float]:
