@@ -1,0 +1,109 @@
+"""How a walker gets back under a limit that its state is already beyond.
+
+    python tests/benchmarks/recovery.py [--task hopper] [--n 20] [--seed 100] [--standing]
+
+The limited rate is set to a value beyond its limit, up or down, in mid-stride: at steps 300, 304, ... of the episodes, so that 20
+of them cover a stride of Hopper; with --standing as the episode begins. Then, recommended: how many steps h stays below 0 for the
+first time, the most of any episode, the largest f = -h five steps on (an exact barrier of alpha 0.85 leaves 0.15^5 of it), how many
+steps of all episodes are unsafe after the first return, and how many episodes fall, within 300 steps.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from cdiff_cli import metrics
+from cdiff_cli.closed_loop import controller
+from cdiff_cli.control import control
+from cdiff_cli.metrics import SAFE
+from cdiff_cli.request import Options, resolve
+
+BEYOND = (1.0, 2.0, 3.0, 5.0)
+STEPS = 300  # after the push
+LIMITED = {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}
+
+
+class Pushed(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The environment, one velocity of it set to a value at a step, 0 the first state."""
+
+    def __init__(self, env: Any, column: int, value: float, at: int) -> None:
+        super().__init__(env)
+        self.column, self.value, self.at, self.done = column, value, at, 0
+
+    def reset(self, **options: Any) -> Any:
+        obs, info = self.env.reset(**options)
+        return self.pushed(obs), info
+
+    def step(self, action: Any) -> Any:
+        obs, *rest = self.env.step(action)
+        self.done += 1
+        return self.pushed(obs), *rest
+
+    def pushed(self, obs: Any) -> Any:
+        if self.done != self.at:
+            return obs
+        inner: Any = self.env.unwrapped
+        velocities = inner.data.qvel.copy()
+        velocities[self.column] = self.value
+        inner.set_state(inner.data.qpos.copy(), velocities)
+        return inner._get_obs()
+
+
+class Pushing:
+    """The task, its environments pushed, each at its own step."""
+
+    def __init__(self, task: Any, value: float, steps: Sequence[int]) -> None:
+        self.task, self.value, self.steps = task, value, list(steps)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.task, name)
+
+    def make_env(self, **options: Any) -> Any:
+        column = self.task.layout.index(LIMITED[self.task.name]) - len(self.task.layout)  # a state ends with all velocities
+        return Pushed(self.task.make_env(**options), column, self.value, self.steps.pop(0))
+
+
+def recovered(task: str, method: str, value: float, seeds: Sequence[int], pushes: Sequence[int]) -> list[str]:
+    """Cells of one row."""
+    acting = controller(resolve(Options(task=task, method=method, n=1, device="cpu")))
+    pushing: Any = Pushing(acting.task, value, pushes)
+    done = control(replace(acting, task=pushing), seeds, steps=max(pushes) + STEPS)
+    f = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt).max(-1)
+    after = np.stack([row[at : at + STEPS + 1] for row, at in zip(f, pushes, strict=True)])  # NaN after a fall
+    unsafe = after > SAFE
+    back = np.array([row.argmin() for row in unsafe])  # the first state that is not unsafe, or the fall
+    later = sum(row[k:].sum() for row, k in zip(unsafe, back, strict=True))
+    fell = np.isnan(after).any(1).sum()
+    depth = np.nanmax(after[:, 5])
+    return [f"{value:+.1f}", method, f"{back.mean():.1f}", f"{back.max()}", f"{depth:+.2f}", f"{later}", f"{fell}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", default="hopper", choices=LIMITED)
+    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--standing", action="store_true")
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds = range(asked.seed, asked.seed + asked.n)
+    pushes = [0 if asked.standing else 300 + 4 * i for i in range(asked.n)]
+    kind = resolve(Options(task=asked.task, n=1, device="cpu")).kinds[0]
+    limit = kind.barrier.b  # type: ignore[union-attr]
+    print(f"{asked.task}, limit {limit:g} rad/s, {asked.n} episodes from seed {asked.seed}\n")
+    heading = ("pushed to", "method", "steps beyond", "most", "f after 5 steps", "later unsafe steps", "fell")
+    print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")
+    for sign in (1, -1):
+        for beyond in BEYOND:
+            for method in ("diffuser", "projected", "alm"):
+                cells = recovered(asked.task, method, sign * (limit + beyond), seeds, pushes)
+                print(f"| {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
