@@ -2,10 +2,10 @@
 
     python tests/benchmarks/recovery.py [--task hopper] [--n 20] [--seed 100] [--standing]
 
-The limited rate is set to a value beyond its limit, up or down, in mid-stride: at steps 300, 304, ... of the episodes, so that 20
-of them cover a stride of Hopper; with --standing as the episode begins. Then, recommended: how many steps h stays below 0 for the
-first time, the most of any episode, the largest f = -h five steps on (an exact barrier of alpha 0.85 leaves 0.15^5 of it), how many
-steps of all episodes are unsafe after the first return, and how many episodes fall, within 300 steps.
+In mid-stride, the limited rate is set to a value beyond its limit: in each episode at the first state from step 300 (304, 308, ...)
+on whose rate is within 0.5 rad/s of the limit on that side anyway; with --standing as the episode begins. Then, recommended: how
+many steps h stays below 0 for the first time, the most of any episode, the largest f = -h five steps on (an exact barrier of alpha
+0.85 leaves 0.15^5 of it), how many steps of all episodes are unsafe after the first return, and how many fall, in 300 steps.
 """
 
 import argparse
@@ -23,17 +23,22 @@ from cdiff_cli.control import control
 from cdiff_cli.metrics import SAFE
 from cdiff_cli.request import Options, resolve
 
-BEYOND = (1.0, 2.0, 3.0, 5.0)
-STEPS = 300  # after the push
+BEYOND = (0.5, 1.0, 2.0, 3.0, 5.0)
+STEPS, STRIDE = 300, 120  # after the push; the most steps of a stride
+NEAR = 0.5
 LIMITED = {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}
 
 
 class Pushed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """The environment, one velocity of it set to a value at a step, 0 the first state."""
+    """The environment, one velocity of it set to a value once: at the first state from step `since` on that is near it.
 
-    def __init__(self, env: Any, column: int, value: float, at: int) -> None:
+    at   the number of that state, 0 the first of the episode; None before
+    """
+
+    def __init__(self, env: Any, column: int, value: float, since: int, near: float) -> None:
         super().__init__(env)
-        self.column, self.value, self.at, self.done = column, value, at, 0
+        self.column, self.value, self.since, self.near = column, value, since, near
+        self.done, self.at = 0, None
 
     def reset(self, **options: Any) -> Any:
         obs, info = self.env.reset(**options)
@@ -45,42 +50,44 @@ class Pushed(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.pushed(obs), *rest
 
     def pushed(self, obs: Any) -> Any:
-        if self.done != self.at:
-            return obs
         inner: Any = self.env.unwrapped
         velocities = inner.data.qvel.copy()
-        velocities[self.column] = self.value
+        if self.at is not None or self.done < self.since or np.sign(self.value) * velocities[self.column] < self.near:
+            return obs
+        self.at, velocities[self.column] = self.done, self.value
         inner.set_state(inner.data.qpos.copy(), velocities)
         return inner._get_obs()
 
 
 class Pushing:
-    """The task, its environments pushed, each at its own step."""
+    """The task, its environments pushed, each from another step on."""
 
-    def __init__(self, task: Any, value: float, steps: Sequence[int]) -> None:
-        self.task, self.value, self.steps = task, value, list(steps)
+    def __init__(self, task: Any, value: float, since: Sequence[int], near: float) -> None:
+        self.task, self.value, self.since, self.near = task, value, since, near
+        self.made: list[Pushed] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.task, name)
 
     def make_env(self, **options: Any) -> Any:
         column = self.task.layout.index(LIMITED[self.task.name]) - len(self.task.layout)  # a state ends with all velocities
-        return Pushed(self.task.make_env(**options), column, self.value, self.steps.pop(0))
+        self.made.append(Pushed(self.task.make_env(**options), column, self.value, self.since[len(self.made)], self.near))
+        return self.made[-1]
 
 
-def recovered(task: str, method: str, value: float, seeds: Sequence[int], pushes: Sequence[int]) -> list[str]:
+def recovered(task: str, method: str, value: float, seeds: Sequence[int], since: Sequence[int], near: float) -> list[str]:
     """Cells of one row."""
     acting = controller(resolve(Options(task=task, method=method, n=1, device="cpu")))
-    pushing: Any = Pushing(acting.task, value, pushes)
-    done = control(replace(acting, task=pushing), seeds, steps=max(pushes) + STEPS)
+    pushing: Any = Pushing(acting.task, value, since, near)
+    done = control(replace(acting, task=pushing), seeds, steps=max(since) + STRIDE + STEPS)
     f = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt).max(-1)
-    after = np.stack([row[at : at + STEPS + 1] for row, at in zip(f, pushes, strict=True)])  # NaN after a fall
-    unsafe = after > SAFE
+    after = np.stack([row[env.at :][: STEPS + 1] for row, env in zip(f, pushing.made, strict=True) if env.at is not None])
+    unsafe = after > SAFE  # NaN after a fall
     back = np.array([row.argmin() for row in unsafe])  # the first state that is not unsafe, or the fall
     later = sum(row[k:].sum() for row, k in zip(unsafe, back, strict=True))
     fell = np.isnan(after).any(1).sum()
-    depth = np.nanmax(after[:, 5])
-    return [f"{value:+.1f}", method, f"{back.mean():.1f}", f"{back.max()}", f"{depth:+.2f}", f"{later}", f"{fell}"]
+    steps = f"{back.mean():.1f}", f"{back.max()}", f"{np.nanmax(after[:, 5]):+.2f}"
+    return [f"{value:+.1f}", method, f"{len(after)}", *steps, f"{later}", f"{fell}"]
 
 
 def main() -> None:
@@ -92,16 +99,17 @@ def main() -> None:
     asked = parser.parse_args()
     torch.set_num_threads(1)
     seeds = range(asked.seed, asked.seed + asked.n)
-    pushes = [0 if asked.standing else 300 + 4 * i for i in range(asked.n)]
+    since = [0 if asked.standing else 300 + 4 * i for i in range(asked.n)]
     kind = resolve(Options(task=asked.task, n=1, device="cpu")).kinds[0]
     limit = kind.barrier.b  # type: ignore[union-attr]
+    near = -np.inf if asked.standing else limit - NEAR
     print(f"{asked.task}, limit {limit:g} rad/s, {asked.n} episodes from seed {asked.seed}\n")
-    heading = ("pushed to", "method", "steps beyond", "most", "f after 5 steps", "later unsafe steps", "fell")
+    heading = ("pushed to", "method", "n", "steps beyond", "most", "f after 5 steps", "later unsafe steps", "fell")
     print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")
     for sign in (1, -1):
         for beyond in BEYOND:
             for method in ("diffuser", "projected", "alm"):
-                cells = recovered(asked.task, method, sign * (limit + beyond), seeds, pushes)
+                cells = recovered(asked.task, method, sign * (limit + beyond), seeds, since, near)
                 print(f"| {' | '.join(cells)} |", flush=True)
 
 
