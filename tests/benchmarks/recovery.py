@@ -1,6 +1,6 @@
 """How a walker gets back under a limit that its state is already beyond.
 
-    python tests/benchmarks/recovery.py [--task hopper] [--n 20] [--seed 100] [--standing]
+    python tests/benchmarks/recovery.py [--task hopper] [--n 20] [--seed 100] [--methods alm] [--standing]
 
 In mid-stride, the limited rate is set to a value beyond its limit: in each episode at the first state from step 300 (304, 308, ...)
 on whose rate is within 0.5 rad/s of the limit on that side anyway; with --standing as the episode begins. Then, recommended: how
@@ -26,6 +26,7 @@ from cdiff_cli.request import Options, resolve
 BEYOND = (0.5, 1.0, 2.0, 3.0, 5.0)
 STEPS, STRIDE = 300, 120  # after the push; the most steps of a stride
 NEAR = 0.5
+EXPERT = "the gait itself"
 LIMITED = {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}
 
 
@@ -75,19 +76,32 @@ class Pushing:
         return self.made[-1]
 
 
+def walked(pushing: Any, seeds: Sequence[int], steps: int) -> Any:
+    """States of the demonstrated gait itself [n, steps + 1, dim], NaN after a fall."""
+    x = np.full((len(seeds), steps + 1, len(pushing.layout)), np.nan)
+    for row, seed in zip(x, seeds, strict=True):
+        seen: list[Any] = []
+        pushing.walk(pushing.make_env(), pushing.experts()[0], seed, seen=seen)
+        row[: len(seen)] = seen[: steps + 1]
+    return x
+
+
 def recovered(task: str, method: str, value: float, seeds: Sequence[int], since: Sequence[int], near: float) -> list[str]:
     """Cells of one row."""
-    acting = controller(resolve(Options(task=task, method=method, n=1, device="cpu")))
+    planned = "diffuser" if method == EXPERT else method
+    acting = controller(resolve(Options(task=task, method=planned, n=1, device="cpu")))
     pushing: Any = Pushing(acting.task, value, since, near)
-    done = control(replace(acting, task=pushing), seeds, steps=max(since) + STRIDE + STEPS)
-    f = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt).max(-1)
+    steps = max(since) + STRIDE + STEPS
+    x = walked(pushing, seeds, steps) if method == EXPERT else control(replace(acting, task=pushing), seeds, steps=steps).x
+    f = metrics.executed_levels(acting.g, x, {}, acting.task.dt).max(-1)
     after = np.stack([row[env.at :][: STEPS + 1] for row, env in zip(f, pushing.made, strict=True) if env.at is not None])
     unsafe = after > SAFE  # NaN after a fall
     back = np.array([row.argmin() for row in unsafe])  # the first state that is not unsafe, or the fall
     later = sum(row[k:].sum() for row, k in zip(unsafe, back, strict=True))
     fell = np.isnan(after).any(1).sum()
-    steps = f"{back.mean():.1f}", f"{back.max()}", f"{np.nanmax(after[:, 5]):+.2f}"
-    return [f"{value:+.1f}", method, f"{len(after)}", *steps, f"{later}", f"{fell}"]
+    left = after[:, 5][np.isfinite(after[:, 5])]
+    depth = f"{left.max():+.2f}" if len(left) else "all fell"
+    return [f"{value:+.1f}", method, f"{len(after)}", f"{back.mean():.1f}", f"{back.max()}", depth, f"{later}", f"{fell}"]
 
 
 def main() -> None:
@@ -95,6 +109,7 @@ def main() -> None:
     parser.add_argument("--task", default="hopper", choices=LIMITED)
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--methods", nargs="+", default=(EXPERT, "diffuser", "projected", "alm"))
     parser.add_argument("--standing", action="store_true")
     asked = parser.parse_args()
     torch.set_num_threads(1)
@@ -108,7 +123,7 @@ def main() -> None:
     print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")
     for sign in (1, -1):
         for beyond in BEYOND:
-            for method in ("diffuser", "projected", "alm"):
+            for method in asked.methods:
                 cells = recovered(asked.task, method, sign * (limit + beyond), seeds, since, near)
                 print(f"| {' | '.join(cells)} |", flush=True)
 
