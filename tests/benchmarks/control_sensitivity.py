@@ -5,8 +5,8 @@
 
 Recommended alm throughout, each row with margins of its own: those shipped where they fit, else calibrated here as `cdiff rollout
 --calibrate` does, on 100 episodes a pass from seed 5000 at level 0.99, and with --keep written beside the checkpoint. The picture
-shows h = limit - |w| for each alpha: along the first episode, and the median of all approaches to the limit in all episodes, which
-begin where h falls below 2.5 rad/s and get nearer than 1; dotted, (1 - alpha)^k h, the fastest fall that the barrier allows.
+shows h = limit - |w| for each alpha: along the first episode, and the median of a stride's nearest approach to the limit, over all
+strides and episodes, from the last step above 2.2 rad/s on; dotted, the fastest fall that the barrier allows, to its margin.
 """
 
 import argparse
@@ -34,8 +34,8 @@ from cdiff_cli.recipe import home
 from cdiff_cli.request import Options, Resolved, resolve
 
 ALPHAS = (0.1, 0.3, 0.5, 0.85, 1.0)
-FROM, NEAR = 2.5, 1.0  # rad/s: an approach falls below the first, and below the second within its steps
-APPROACH, SHOWN = 20, 100  # steps of an approach; of the first episode, which begin a tenth of them before its first approach
+FROM = 2.2  # rad/s: where an approach begins
+STRIDE, APPROACH = 36, 14  # steps: half a stride of Hopper, at most; of an approach
 
 
 def changed(task: str, alpha: float | None = None, **options: Any) -> Options:
@@ -66,26 +66,31 @@ def fitted(options: Options, keep: bool) -> Resolved:
 
 
 def approaches(h: Any) -> list[tuple[int, int]]:
-    """(episode, the last step above FROM) of each [n, steps + 1]."""
-    falls = np.argwhere((h[:, :-APPROACH] >= FROM) & (h[:, 1 : 1 - APPROACH] < FROM))
-    return [(i, k) for i, k in falls.tolist() if SHOWN <= k < h.shape[1] - SHOWN and np.nanmin(h[i, k : k + APPROACH + 1]) < NEAR]
+    """(episode, the last step at FROM or above) before each smallest h of a stride [n, steps + 1]."""
+    found = []
+    for i, row in enumerate(h):
+        for k in range(3 * STRIDE, len(row) - 3 * STRIDE):
+            if row[k] == row[k - STRIDE : k + STRIDE + 1].min():
+                above = np.flatnonzero(row[k - STRIDE : k] >= FROM)
+                found += [(i, k - STRIDE + int(above[-1]))] if len(above) else []
+    return found
 
 
-def draw(axes: Any, name: str, h: Any, alpha: float | None, dt: float, colour: Any) -> None:
+def draw(axes: Any, name: str, h: Any, alpha: float | None, margin: float, dt: float, colour: Any) -> None:
     """h of one alpha, None: no constraint."""
     found = approaches(h)
     if not found:
         return
-    together = np.array([h[i, k : k + APPROACH + 1] for i, k in found])
     episode, begin = found[0]
-    shown = np.arange(-SHOWN // 10, SHOWN)
+    shown = np.arange(-2 * STRIDE, STRIDE)
     axes[0].plot(dt * shown, h[episode, begin + shown], label=name, lw=1.2, color=colour)
-    time = dt * np.arange(APPROACH + 1)
+    steps = np.arange(APPROACH + 1)
+    together = np.array([h[i, k + steps] for i, k in found])
     middle = np.median(together, 0)
-    axes[1].plot(time, middle, lw=1.6, color=colour)
-    axes[1].fill_between(time, *np.quantile(together, (0.1, 0.9), axis=0), color=colour, alpha=0.15, lw=0)
+    axes[1].plot(dt * steps, middle, lw=1.6, color=colour)
+    axes[1].fill_between(dt * steps, *np.quantile(together, (0.1, 0.9), axis=0), color=colour, alpha=0.15, lw=0)
     if alpha is not None and alpha < 1:
-        axes[1].plot(time, middle[0] * (1 - alpha) ** np.arange(APPROACH + 1), ":", lw=1, color=colour)
+        axes[1].plot(dt * steps, margin + (middle[0] - margin) * (1 - alpha) ** steps, ":", lw=1, color=colour)
 
 
 def main() -> None:
@@ -123,16 +128,17 @@ def main() -> None:
         table.add_row(name, margins, found.returned(), rate, total, found.worst(), f"{fall:.2f}", f"{found.done.fell.sum()}")
         if name.startswith("alpha"):
             alpha = None if resolved.options.method == "diffuser" else float(name.split()[1])
-            draw(axes, name.removeprefix("alpha: "), h, alpha, acting.task.dt, next(colours))
+            margin = max(resolved.margins.margins.values(), default=0.0)
+            draw(axes, name.removeprefix("alpha: "), h, alpha, margin, acting.task.dt, next(colours))
         Console(stderr=True).print(name, margins, found.returned(), rate, found.worst())
     Console(width=130).print(table)
     if asked.picture:
         for axis in axes:
             axis.axhline(0, color="#d1495b", lw=1.2)
             axis.set(xlabel="time / s")
-        axes[0].set(ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit", ylim=(-1.2, None))
-        axes[1].set(title="approaches, median and 80 %; dotted: the barrier's bound")
-        axes[0].legend(fontsize=8, frameon=False, ncols=3, loc="lower right")
+        axes[0].set(ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit", ylim=(-1.2, 4.6))
+        axes[1].set(title="approaches: median, 80 %; dotted: bound")
+        axes[0].legend(fontsize=8, frameon=False, ncols=3, loc="upper center")
         figure.tight_layout()
         figure.savefig(asked.picture, dpi=110)
 
