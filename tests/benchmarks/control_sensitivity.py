@@ -36,6 +36,7 @@ from cdiff_cli.request import Options, Resolved, resolve
 ALPHAS = (0.1, 0.3, 0.5, 0.85, 1.0)
 FROM = 2.2  # rad/s: where an approach begins
 STRIDE, APPROACH = 36, 14  # steps: half a stride of Hopper, at most; of an approach
+SETTLED = 500  # step after which every stride is like the last
 
 
 def changed(task: str, alpha: float | None = None, **options: Any) -> Options:
@@ -81,7 +82,7 @@ def draw(axes: Any, name: str, h: Any, alpha: float | None, margin: float, dt: f
     found = approaches(h)
     if not found:
         return
-    episode, begin = found[0]
+    episode, begin = next((each for each in found if each[1] >= SETTLED), found[-1])
     shown = np.arange(-2 * STRIDE, STRIDE)
     axes[0].plot(dt * shown, h[episode, begin + shown], label=name, lw=1.2, color=colour)
     steps = np.arange(APPROACH + 1)
