@@ -36,8 +36,8 @@ experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 2
 margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour or more
 	for c in hopper hopper-hard swimmer swimmer-hard; do for m in alm projected primal-dual safediffuser; do \
 		$(BIN)/cdiff $(CALIBRATE) --task $${c%-hard} --constraints constraints/$$c.yaml --method $$m || exit 1; done; done
-	for c in hopper swimmer; do for k in 2 4 8; do \
-		$(BIN)/cdiff $(CALIBRATE) --task $$c --execute $$k || exit 1; done; done
+	for c in hopper swimmer; do for k in '--execute 2' '--execute 4' '--execute 8' '--warm 0.3'; do \
+		$(BIN)/cdiff $(CALIBRATE) --task $$c $$k || exit 1; done; done
 
 .venv/.ready: requirements.txt pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv

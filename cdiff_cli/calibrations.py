@@ -5,7 +5,8 @@ conditions, several of one constraint file side by side. A rollout takes the fir
 
 exact       the same constraints and all the same conditions
 other       the same constraints: first of the same method, then with the fewest other conditions, then the latest
-renumbered  a file of the same name whose constraints, of the same names, say something else (another alpha, another limit)
+renumbered  a file of the same name whose constraints, of the same names, say something else (another alpha, another limit): of
+            those as near otherwise the one with the widest margin
 none        no margin at all
 given       the user's own
 unused      the preset, or the method, asks for none
@@ -131,9 +132,12 @@ def choose(calibrations: Sequence[Calibration], weights_sha256: str, stem: str, 
     def nearness(each: Calibration) -> tuple[bool, int]:
         return each.conditions.method == now.method, -len(each.conditions.unlike(now))
 
+    def widest(each: Calibration) -> tuple[bool, int, float]:
+        return *nearness(each), max((margin.margin for margin in each.margins.values()), default=0.0)
+
     for match, found in (("other", same), ("renumbered", renumbered)):
         if found:
-            best = max(reversed(found), key=nearness)  # of equals the first met, which is the latest
+            best = max(reversed(found), key=nearness if found is same else widest)  # of equals the first met, which is the latest
             unlike = tuple(best.conditions.unlike(now))
             exact = match == "other" and not unlike
             margins = {name: each.margin for name, each in best.margins.items()}

@@ -18,13 +18,14 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",  # in rich's own, a default in brackets would vanish
     help="Safe planning with diffusion models: constraints as YAML in, trajectories that obey them out.",
     epilog="Start with: cdiff plan --method alm",
 )
 out = Console(width=None if sys.stdout.isatty() else 160)  # a pipe has no width of its own
 
 RUNS = Path("runs")
-TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large or gaussian2d")]
+TaskName = Annotated[str, typer.Option("--task", help="maze2d-umaze, maze2d-large, ball-run, hopper, swimmer, gaussian2d")]
 MethodName = Annotated[str, typer.Option("--method", help=", ".join(METHOD_ORDER))]
 PresetName = Annotated[str, typer.Option("--preset", help="recommended (ours), paper (as printed), released (the authors' code)")]
 ConstraintFile = Annotated[Path | None, typer.Option("--constraints", help="YAML file of constraints [default: the task's own]")]

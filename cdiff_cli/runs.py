@@ -122,7 +122,7 @@ CONTROL_TABLE = (
     "latency_p95",
     "overhead",
 )
-PAPER_TABLE = ("distance_paper", "violation_paper", "step_ms")
+PAPER_TABLE = ("distance", "distance_paper", "violation_paper", "step_ms")
 
 
 class NewRun:

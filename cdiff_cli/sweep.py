@@ -144,13 +144,14 @@ def run_jobs(
     """Outcomes as they come; a job that fails has its error in its outcome."""
     from joblib import Parallel, delayed
 
-    with _backend(backend, address):
+    with _backend(backend, address, workers):
         runs = [delayed(run_job)(job, root.absolute(), Path.cwd()) for job in jobs]
         if backend != "ray":
             yield from Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")(runs)
             return
-        for first in range(0, len(runs), 4 * workers):  # its joblib backend hands results back all at once alone
-            yield from Parallel(n_jobs=workers, batch_size=1)(runs[first : first + 4 * workers])
+        with Parallel(n_jobs=workers, batch_size=1) as pool:
+            for first in range(0, len(runs), 4 * workers):  # its joblib backend hands results back all at once alone
+                yield from pool(runs[first : first + 4 * workers])
 
 
 def run_job(job: Job, root: Path, folder: Path) -> Outcome:
@@ -190,7 +191,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _backend(name: str, address: str | None) -> Iterator[None]:
+def _backend(name: str, address: str | None, workers: int) -> Iterator[None]:
     """joblib's processes here, or the cluster at an address by its own joblib backend."""
     from joblib import parallel_config
 
@@ -198,19 +199,36 @@ def _backend(name: str, address: str | None) -> Iterator[None]:
         with _extra(name):
             import ray
             from ray.util.joblib import register_ray
-        ray.init(address=address, log_to_driver=False, logging_level="error")
-        register_ray()
-        with parallel_config("ray"):
-            yield
-        ray.shutdown()
+        with _reached(name, address):
+            ray.init(address=address, log_to_driver=False, logging_level="error")
+        try:
+            cpus = int(ray.cluster_resources().get("CPU", 0))
+            if workers > cpus:
+                raise CdiffError(f"--jobs: the Ray cluster has {cpus} CPUs, one for each job; found {workers}")
+            register_ray()
+            with parallel_config("ray", ray_remote_args={"num_cpus": 1}):  # its workers ask for none: one node may get all
+                yield
+        finally:
+            ray.shutdown()
     elif name == "dask":
         with _extra(name):
             from dask.distributed import Client
-        with Client(address), parallel_config("dask"):
+        with _reached(name, address):
+            client = Client(address)
+        with client, parallel_config("dask"):
             yield
     else:
         with parallel_config("loky", inner_max_num_threads=1):
             yield
+
+
+@contextlib.contextmanager
+def _reached(name: str, address: str | None) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError, RuntimeError) as error:
+        where = f"--address {address}" if address else f"--backend {name}"
+        raise CdiffError(f"{where}: no {name} cluster answers there: {' '.join(str(error).split())[:200]}") from None
 
 
 @contextlib.contextmanager

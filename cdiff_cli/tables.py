@@ -74,7 +74,8 @@ def notes(groups: Sequence[Group], metrics: Sequence[str]) -> list[str]:
 
 PAPER_NOTES = {
     "": "±: ours is the standard error over n seeds; the paper's, over 10, reads like a standard deviation",
-    "distance_paper": "distance (paper): to the mean unconstrained plan, as released; distance / m is to that of the same noise",
+    "distance": "distance / m: to the unconstrained plan of the same noise; distance (paper): to the mean unconstrained plan, as "
+    "released; it takes runs of several seeds, and a sweep's have one",
     "violation_paper": "violation (paper): at the waypoints, in the paper's units; a plan can be unsafe between them all the same",
     "step_ms": "step / ms: wall time of the whole batch over its network calls; the paper's: a diffusion step, RTX 4060",
     "reward": "return: the paper's experts are others, and its ball run's obstacle is not described",

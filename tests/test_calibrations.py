@@ -92,6 +92,8 @@ def test_another_alpha_in_the_same_file_is_a_last_resort_and_is_said():
     renumbered = made(0.1, content="other")
     assert chosen([renumbered]) == (0.1, "renumbered")
     assert chosen([renumbered, made(0.2, now(execute=8))]) == (0.2, "other")
+    assert chosen([made(0.3, content="a third"), renumbered]) == (0.3, "renumbered")  # which is nearer nobody knows: the safe one
+    assert chosen([made(0.3, now(execute=8), content="a third"), renumbered]) == (0.1, "renumbered")
     assert chosen([renumbered], stem="hard") == (None, "none")
     assert "calibrated when easy.yaml said a: h' >= 0.15 h;" in choose([renumbered], "w", "easy", "c", NOW).note(
         NOW, "easy.yaml", "x"

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from cdiff_cli.cli import app
 from cdiff_cli.recipe import Recipe, home, load_recipe
 from cdiff_cli.runs import COLUMNS, METHOD_ORDER, read_rows
+from cdiff_cli.tasks import TASKS
 
 ROOT = Path(__file__).parent.parent
 
@@ -311,6 +312,12 @@ def test_gaussian2d_cannot_be_trained_or_rolled_out(tmp_path):
 def test_help_names_every_method():
     shown = " ".join(cdiff("plan", "--help").stdout.replace("│", " ").split())
     assert ", ".join(METHOD_ORDER) in shown
+
+
+def test_help_names_every_task_and_what_is_taken_where_nothing_is_said():
+    shown = " ".join(cdiff("rollout", "--help").stdout.replace("│", " ").split())
+    assert ", ".join(TASKS) in shown
+    assert "YAML file of constraints [default: the task's own]" in shown
 
 
 def test_help_names_every_command_and_imports_no_torch():

@@ -119,7 +119,7 @@ def test_a_walker_that_begins_beyond_its_limit_comes_back_to_it(case):
 
 
 def test_a_projected_walker_comes_back_to_within_its_own_error():
-    """Its margins are those of alm; 0.15 rad/s is what they lack of it."""
+    """It rides its margin, which was fitted to walks, not to such a start: 0.15 rad/s is what it lacks here."""
     f, rows = acted_from("hopper down", "projected")
     assert f[:, 5:].max() <= 0.15
     assert max(row["fell"] for row in rows) == 0

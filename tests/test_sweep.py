@@ -180,6 +180,33 @@ def test_a_backend_that_is_not_installed_names_its_extra(backend, tmp_path, monk
     assert f"cdiff[{backend}]" in cdiff("sweep", *words, "--runs", tmp_path, code=2).stderr
 
 
+def cluster(monkeypatch, cpus=None):
+    """A Ray of that many CPUs, which no address reaches where None."""
+
+    def init(**_):
+        if cpus is None:
+            raise ConnectionError("nobody\nthere")
+
+    ray = SimpleNamespace(init=init, shutdown=lambda: None, cluster_resources=lambda: {"CPU": cpus})
+    for name, module in (("ray", ray), ("ray.util", None), ("ray.util.joblib", SimpleNamespace(register_ray=lambda: None))):
+        monkeypatch.setitem(sys.modules, name, module)
+
+
+RAY = ("sweep", "--task", "gaussian2d", "--methods", "diffuser", "--seeds", 1, "--backend", "ray", "--address", "head:1")
+
+
+def test_an_address_where_no_cluster_answers_is_one_clear_line(tmp_path, monkeypatch):
+    cluster(monkeypatch)
+    stderr = cdiff(*RAY, "--runs", tmp_path, code=2).stderr
+    assert stderr == "error: --address head:1: no ray cluster answers there: nobody there\n"
+
+
+def test_more_jobs_than_a_ray_cluster_has_cpus_would_wait_for_ever_and_are_refused(tmp_path, monkeypatch):
+    cluster(monkeypatch, cpus=2)
+    stderr = cdiff(*RAY, "--jobs", 3, "--runs", tmp_path, code=2).stderr
+    assert "--jobs: the Ray cluster has 2 CPUs, one for each job; found 3" in stderr
+
+
 def test_names_are_checked_before_anything_is_resolved(monkeypatch, tmp_path):
     monkeypatch.setattr(sweep, "resolve", None)
     with pytest.raises(CdiffError, match="no method"):

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from cdiff_cli.runs import COLUMNS, CONTROL_TABLE, KEYS, PAPER_TABLE, compare
-from cdiff_cli.tables import FORMATS, header_and_lines, read_paper, render
+from cdiff_cli.tables import FORMATS, header_and_lines, notes, read_paper, render
 
 METRICS = ("distance_paper", "violation_paper", "steps")
 ROWS = [
@@ -106,6 +106,16 @@ def test_rich_moves_what_all_rows_share_into_the_title():
 @pytest.mark.parametrize("style", FORMATS)
 def test_no_groups_make_an_empty_table(style):
     assert render([], METRICS, style) is not None
+
+
+def test_beside_the_papers_values_runs_of_one_seed_have_a_distance_too():
+    """Of one plan there is no mean unconstrained one: a sweep's runs have no distance (paper)."""
+    groups = compare(
+        [{**dict(zip(KEYS, ("maze2d-umaze", "maze2d-umaze", "alm", "paper"), strict=True)), "seed": "0", "distance": 2.0}]
+    )
+    header, (line,) = header_and_lines(groups, PAPER_TABLE, PAPER)
+    assert (header[5:], line[5:]) == (["distance / m"], ["2.00"])
+    assert [note for note in notes(groups, PAPER_TABLE) if note.startswith("distance / m: ")]
 
 
 def test_the_shipped_paper_values_are_read():

@@ -83,7 +83,7 @@ def main() -> None:
     for task in asked.task:
         for preset, warm in (("recommended", None), *((f"recommended, warm {warm:g}", warm) for warm in asked.warm)):
             each = {m: controller(resolve(Options(task=task, method=m, warm=warm))) for m in asked.methods}
-            found: dict[str, list[Any]] = {m: [] for m in METHODS}
+            found: dict[str, list[Any]] = {m: [] for m in asked.methods}
             for _ in range(asked.repeats):
                 for method, acting in each.items():
                     found[method].append(control(acting, [100], steps=asked.steps))
