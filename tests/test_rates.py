@@ -13,7 +13,7 @@ from cdiff_cli.constraint import Constraint, Pins, pull_back, stack
 from cdiff_cli.errors import CdiffError, InfeasibleError, SpecError
 from cdiff_cli.metrics import rollout_metrics, unsafe_segments
 from cdiff_cli.projection import project
-from cdiff_cli.rates import Rate, Slowed, limits
+from cdiff_cli.rates import Rate, Slowed, independent, limits
 from cdiff_cli.request import Options, fastest, resolve
 from cdiff_cli.safediffuser import jacobian
 from cdiff_cli.spec import json_schema, load_constraints
@@ -173,9 +173,23 @@ def test_each_plan_s_own_frame_is_used():
 
 def test_a_projection_begun_where_the_last_one_ended_ends_at_the_same_point():
     z, part = 0.1 * normal(0, 2, 30, 2), LIMITS["length"]
-    slowed = Slowed(part, Pins.none(z))
+    slowed = Slowed([part], Pins.none(z))
     slowed(z + 0.01 * normal(1, 2, 30, 2))
     torch.testing.assert_close(slowed(z), free_projection(only(part), z), atol=1e-8, rtol=0)
+
+
+def test_limits_that_share_no_coordinate_are_met_at_the_nearest_point():
+    z, both = 0.3 * normal(0, 2, 20, 2), Constraint((LIMITS["upper"], rate(2, (1,), high=0.7, dt=0.1, name="other")))
+    assert independent(both.parts)
+    assert all(bool((part(z) > 0).any()) for part in both.parts)
+    x = project(both, z, pin(z, 0))
+    torch.testing.assert_close(x, qp_projection(both, z, pin(z, 0)), atol=1e-6, rtol=0)  # ProxQP's own accuracy
+
+
+def test_limits_that_share_a_coordinate_are_not_taken_one_after_another():
+    assert not independent([LIMITS["upper"], LIMITS["length"]])
+    z, both = 0.3 * normal(0, 2, 20, 2), Constraint((LIMITS["upper"], LIMITS["length"]))
+    assert float(both(project(both, z, pin(z, 0))).max()) <= 1e-6  # what project promises, over dt
 
 
 def test_a_disc_a_wall_and_a_limit_hold_together():
