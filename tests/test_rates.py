@@ -188,8 +188,6 @@ def test_limits_that_share_no_coordinate_are_met_at_the_nearest_point():
 
 def test_limits_that_share_a_coordinate_are_not_taken_one_after_another():
     assert not independent([LIMITS["upper"], LIMITS["length"]])
-    z, both = 0.3 * normal(0, 2, 20, 2), Constraint((LIMITS["upper"], LIMITS["length"]))
-    assert float(both(project(both, z, pin(z, 0))).max()) <= 1e-6  # what project promises, over dt
 
 
 def test_a_disc_a_wall_and_a_limit_hold_together():
