@@ -36,7 +36,7 @@ for preset in arguments.presets.split(","):
                 resolved.method,
                 resolved.seeds,
                 kernel=resolved.kernel,
-                extra_steps=resolved.extra_steps,
+                extra_steps=resolved.conditions.extra_steps,
                 polish=resolved.preset.polish,
             )
             outside = plans.total_s - plans.network_s
