@@ -194,6 +194,8 @@ def load_rewards(source: str, episodes: Sequence[Array]) -> list[Array]:
             warnings.simplefilter("ignore")
             dataset = _minari().load_dataset(source)
             rewards = [np.asarray(episode.rewards, dtype=np.float64) for episode in dataset.iterate_episodes()]
+    if len(rewards) != len(episodes):
+        raise CdiffError(f"{source}: {len(rewards)} episodes of rewards for {len(episodes)} of states; repair the dataset")
     sizes, states = [r.size for r in rewards], [len(x) for x in episodes]
     if any(r.ndim != 1 for r in rewards) or any(n - r not in (0, 1) for n, r in zip(states, sizes, strict=True)):
         raise CdiffError(
