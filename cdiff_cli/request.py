@@ -204,8 +204,7 @@ def resolve(options: Options) -> Resolved:
     device = choose_device(options.device)
     schedule = Schedule.cosine(recipe.n_steps)
     if hasattr(task, "denoiser"):
-        checkpoint, denoiser, normaliser = None, task.denoiser(schedule), Normaliser.identity(len(task.layout))
-        returns = 0.0
+        checkpoint, returns, denoiser, normaliser = None, 0.0, task.denoiser(schedule), Normaliser.identity(len(task.layout))
         normaliser = Normaliser(normaliser.centre, normaliser.scale * task.scale)
     else:
         where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")

@@ -198,7 +198,8 @@ class _Fit:
         labels mean, of the return, is left behind.
         """
         if base.card.data_sha256 != self.data_sha256:
-            raise CheckpointError(f"{base.path}: trained on other demonstrations; train it again, then this one")
+            first = f"train it on these first, with --recipe {base.card.recipe}"
+            raise CheckpointError(f"{base.path}: trained on other demonstrations, and this one begins from it; {first}")
         if base.card.network.model_copy(update={"conditions": self.spec.network.conditions}) != self.spec.network:
             raise CheckpointError(f"{base.path}: its network is not the one of this recipe, which begins from it; mend recipe.yaml")
         weights = {name: value for name, value in base.net.state_dict().items() if not name.startswith("condition.")}

@@ -12,7 +12,7 @@ from cdiff_cli.closed_loop import controller
 from cdiff_cli.conditioning import Condition, calls_a_step, guided
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.data import demonstrations, load_rewards
-from cdiff_cli.errors import CdiffError
+from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.examples import Data
 from cdiff_cli.levels import Affine
 from cdiff_cli.recipe import DemonstrationSpec, MlpSpec, Recipe, ReturnSpec, load_recipe
@@ -216,6 +216,18 @@ def test_a_conditional_planner_begins_from_it_without_what_its_labels_mean(whole
     assert (made.card.recipe, made.card.returns) == ("conditional-side", None)
     assert float(made.net.condition.weight.abs().max()) < 1e-6  # the rate is 1e-12
     torch.testing.assert_close(made.net.head[2].weight, whole.net.head[2].weight, atol=1e-6, rtol=1e-3)  # kept in half precision
+
+
+def test_a_base_of_other_demonstrations_is_refused_with_its_recipe(whole, tmp_path, monkeypatch):
+    (tmp_path / "models" / "ball-run").mkdir(parents=True)
+    monkeypatch.setattr("cdiff_cli.training.home", lambda: tmp_path)
+    monkeypatch.setattr("cdiff_cli.checkpoint.home", lambda: tmp_path)
+    install(whole)
+    rng = np.random.default_rng(0)
+    columns = {"observations": rng.normal(size=(200, 4)), "actions": np.zeros((200, 2)), "rewards": rng.normal(size=200)}
+    begun = {"tiny": TOLD.model_copy(update={"begin": "tiny"})}
+    with pytest.raises(CheckpointError, match=r"trained on other demonstrations, .* train it on these first, with --recipe tiny"):
+        fit(tmp_path / "work", recipe=RECIPE.model_copy(update={"train": begun}), dataset=rewards_file(tmp_path, **columns))
 
 
 @pytest.mark.parametrize(
