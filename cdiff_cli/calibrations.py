@@ -39,6 +39,7 @@ class Conditions(Strict):
 
     settings   the method's constants;  steps, extra_steps   diffusion steps, and those with t frozen
     execute, warm, action_noise   as in Controller;  env   options of the environment, as pattern=chaser
+    returns    weight of guidance towards the highest return; 0 without
     """
 
     method: str
@@ -53,6 +54,7 @@ class Conditions(Strict):
     warm: float | None
     action_noise: float
     env: tuple[str, ...]
+    returns: float = 0.0
 
     def unlike(self, other: "Conditions") -> list[str]:
         """Names of what differs, the preset's apart: it stands for the others."""

@@ -20,6 +20,7 @@ from cdiff_cli.networks import InverseDynamics, ResidualMlp, TemporalUnet
 from cdiff_cli.recipe import Card, MlpSpec, NetworkSpec, home, shown
 
 Network = TemporalUnet | ResidualMlp
+RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -43,6 +44,11 @@ class Checkpoint:
     frame: Frame | None = None
     inverse: InverseDynamics | None = None
     telling: Telling | None = None
+
+    @property
+    def limit(self) -> float:
+        """Of a clean estimate, in the network's coordinates: the data's limits, or RELATIVE_LIMIT."""
+        return 1.0 if self.frame is None else RELATIVE_LIMIT
 
 
 def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:

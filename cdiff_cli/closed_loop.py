@@ -117,6 +117,7 @@ def controller(resolved: Resolved) -> Controller:
         task=cast(ControlTask, problem.task),
         denoiser=resolved.guided or problem.denoiser,
         seeing=resolved.seeing,
+        calls_a_step=resolved.calls_a_step,
         schedule=problem.schedule,
         frame=checkpoint.frame,
         inverse=checkpoint.inverse,
@@ -162,10 +163,7 @@ def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -
     measured = metrics.control_metrics(done, levels, (space.low.astype(float), space.high.astype(float)))
     told = resolved.row()
     told["constraints"] = " ".join((told["constraints"], *resolved.options.env))  # what was met is part of what was asked
-    return [
-        told | {"seed": seed} | values | {"calls": acting.calls * resolved.calls_a_step}
-        for seed, values in zip(resolved.seeds, measured, strict=True)
-    ]
+    return [told | {"seed": seed} | values | {"calls": acting.calls} for seed, values in zip(resolved.seeds, measured, strict=True)]
 
 
 def _write(path: Path, resolved: Resolved, acting: Controller, done: Episodes, rows: list[Row]) -> None:

@@ -1,4 +1,4 @@
-"""Classifier-free conditioning on constraints: labels of training windows, what is observed beside them, the guided estimate."""
+"""Classifier-free conditioning: labels of training windows by constraints, what is observed beside them, the guided estimate."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -92,21 +92,29 @@ def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
     return label * keep
 
 
-def guided(net: nn.Module, weight: float, limit: float = 1.0, told: Tensor | None = None) -> Denoiser:
-    """x0 = x0(no condition) + weight (x0(obeys) - x0(no condition)) (Ho and Salimans, 2022, Eq. 6 for estimates of x0), clipped to
-    the data's limits. Both estimates are made in one batch; weight 1 needs the conditioned one alone.
+def guided(net: nn.Module, weight: float = 0.0, limit: float = 1.0, told: Tensor | None = None) -> Denoiser:
+    """x0 = x0(no condition) + weight (x0(asked) - x0(no condition)) (Ho and Salimans, 2022, Eq. 6 for estimates of x0), clipped to
+    the data's limits. Asked for is the label (1, 0): a window that obeys, or the highest return. Both estimates are made in one
+    batch; weight 1 needs the conditioned one alone, weight 0 the other, which every network has.
 
     told   what is observed, beside the label [batch, k]
     """
 
     def clean(x: Traj, t: int) -> Traj:
+        steps = torch.full((len(x),), float(t), device=x.device)
+        if weight == 0.0:
+            return net(x, steps).clamp(-limit, limit)
         asked = torch.tensor([1.0, 0.0], device=x.device).expand(len(x), -1)
         asked = asked if told is None else torch.cat((asked, told.to(asked)), 1)
-        steps = torch.full((len(x),), float(t), device=x.device)
         if weight == 1.0:
             return net(x, steps, asked).clamp(-limit, limit)
         both = net(torch.cat((x, x)), torch.cat((steps, steps)), torch.cat((asked, torch.zeros_like(asked))))
-        obeys, free = both.chunk(2)
-        return (free + weight * (obeys - free)).clamp(-limit, limit)
+        wanted, free = both.chunk(2)
+        return (free + weight * (wanted - free)).clamp(-limit, limit)
 
     return clean
+
+
+def calls_a_step(weight: float) -> int:
+    """Network calls that guided() takes for one estimate."""
+    return 1 if weight in (0.0, 1.0) else 2

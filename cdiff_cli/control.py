@@ -37,6 +37,7 @@ class Controller:
     """All that acting needs, resolved.
 
     seeing        the denoiser of a planner that is told what is observed, anew at each plan; None of the others
+    calls_a_step  network calls that the denoiser takes for one estimate
     g             as declared: what is scored                                    environment units
     enforced      what plans obey: g, tightened by the margin                    environment units
     temperature   factor on all noise: below 1 plans stay nearer the mean
@@ -70,6 +71,7 @@ class Controller:
     brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
     seeing: Seeing | None = None
+    calls_a_step: int = 1
 
     @property
     def horizon(self) -> int:
@@ -93,7 +95,7 @@ class Controller:
     @property
     def calls(self) -> int:
         """Network calls a control step at which plans are made."""
-        return self.tries * (self.redone + self.extra_steps)
+        return self.tries * (self.redone + self.extra_steps) * self.calls_a_step
 
 
 def control(

@@ -185,6 +185,27 @@ def load_inputs(task: Task, source: str) -> list[Array]:
         return [np.asarray(episode.actions, dtype=np.float64) for episode in dataset.iterate_episodes()]
 
 
+def load_rewards(source: str, episodes: Sequence[Array]) -> list[Array]:
+    """The rewards of the episodes of a Minari dataset or of an HDF5 file, each [steps]."""
+    if Path(source).suffix in (".hdf5", ".h5"):
+        rewards = _hdf5(Path(source), "rewards", ", for its recipe conditions the planner on the return")
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            dataset = _minari().load_dataset(source)
+            rewards = [np.asarray(episode.rewards, dtype=np.float64) for episode in dataset.iterate_episodes()]
+    if len(rewards) != len(episodes):
+        raise CdiffError(f"{source}: {len(rewards)} episodes of rewards for {len(episodes)} of states; repair the dataset")
+    sizes, states = [r.size for r in rewards], [len(x) for x in episodes]
+    if any(r.ndim != 1 for r in rewards) or any(n - r not in (0, 1) for n, r in zip(states, sizes, strict=True)):
+        raise CdiffError(
+            f"{source}: rewards of {sum(sizes)} steps for {sum(states)} states; expected one a step, repair the dataset"
+        )
+    if not all(np.isfinite(r).all() for r in rewards):
+        raise CdiffError(f"{source}: rewards hold NaN or inf; repair or choose another dataset")
+    return rewards
+
+
 def digest(episodes: Sequence[Array]) -> str:
     """sha256 over the lengths and the float64 states of the episodes."""
     sha = hashlib.sha256(str([episode.shape for episode in episodes]).encode())
@@ -237,9 +258,9 @@ def _hdf5_episodes(path: Path, task: Task) -> Iterator[Array]:
         yield _checked(task.from_d4rl(_checked(episode, task, str(path))), task, str(path))
 
 
-def _hdf5(path: Path, name: str) -> list[Array]:
-    """That array of the file, episode by episode. D4RL's layout: observations [n, dim], actions [n, m], timeouts or terminals [n]
-    marking each episode's last step.
+def _hdf5(path: Path, name: str, why: str = "") -> list[Array]:
+    """That array of the file, episode by episode. D4RL's layout: observations [n, dim], actions [n, m], rewards [n], timeouts or
+    terminals [n] marking each episode's last step.
     """
     import h5py
 
@@ -255,7 +276,7 @@ def _hdf5(path: Path, name: str) -> list[Array]:
                 if key in file:
                     ends |= np.asarray(file[key], dtype=bool)
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs {name} and timeouts") from None
+        raise CdiffError(f"{path}: not a D4RL-style HDF5 dataset ({error}); it needs {name} and timeouts{why}") from None
     return [episode for episode in np.split(rows, np.flatnonzero(ends) + 1) if len(episode)]
 
 

@@ -13,6 +13,7 @@ from cdiff_cli.data import Array, Normaliser, Windows
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.frames import Frame
 from cdiff_cli.recipe import Recipe, TrainSpec
+from cdiff_cli.returns import Returns
 from cdiff_cli.tasks import ControlTask, Task
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
@@ -74,6 +75,7 @@ class Data:
     frame    of relative windows; None where the data's limits are the coordinates
     pinned   coordinates given clean, in training as in sampling   [horizon, dim]
     beside   quantities that the condition observes; None of the others
+    returns  labels of a planner that is conditioned on the return; None of the others
     """
 
     windows: Windows
@@ -84,13 +86,21 @@ class Data:
     dropout: float
     dt: float
     beside: Beside | None
+    returns: Returns | None
 
     @classmethod
     def of(
-        cls, task: Task, recipe: Recipe, spec: TrainSpec, episodes: Sequence[Array], condition: Condition | None, seed: int
+        cls,
+        task: Task,
+        recipe: Recipe,
+        spec: TrainSpec,
+        episodes: Sequence[Array],
+        condition: Condition | None,
+        seed: int,
+        returns: Returns | None = None,
     ) -> "Data":
         observed = condition.observed if condition else ()
-        asked = condition, spec.dropout, task.dt, Beside.of(task, episodes, observed, seed) if observed else None
+        asked = condition, spec.dropout, task.dt, Beside.of(task, episodes, observed, seed) if observed else None, returns
         pinned = end_pins(recipe.horizon, len(task.layout))
         if recipe.frame == "relative":
             windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
@@ -110,7 +120,8 @@ class Data:
         x = self.windows[index]
         z = x if self.frame is None else self.frame.encode(x)
         if self.condition is None:
-            return z, None
+            returns = self.returns
+            return z, None if returns is None else drop(returns.label[self.windows.starts[index]], self.dropout, generator)
         states = x if self.frame is not None else self.normaliser.decode(x.double())
         if self.beside is None:
             return z, drop(self.condition.label(states), self.dropout, generator)

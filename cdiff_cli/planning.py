@@ -71,15 +71,6 @@ class Plans:
     u: Array | None = None
 
 
-def network_denoiser(net: torch.nn.Module, limit: float = 1.0) -> Denoiser:
-    """x_t, t -> the network's clean estimate, clipped to the data's limits."""
-
-    def clean(x: Traj, t: int) -> Traj:
-        return net(x, torch.full((len(x),), float(t), device=x.device)).clamp(-limit, limit)
-
-    return clean
-
-
 def check_feasible(problem: Problem) -> None:
     """Refuse a start or goal inside a wall or outside the constraints, before anything is sampled."""
     columns = [problem.task.layout.index(name) for name in problem.task.positions]

@@ -57,11 +57,21 @@ class InverseSpec(Strict):
     hidden: tuple[str, ...] = ()
 
 
+class ReturnSpec(Strict):
+    """How windows are labelled by what is earned from their first state on (returns.py).
+
+    discount   of a reward one step later; of the walk, 1 / (1 - discount) steps must be left for a label
+    """
+
+    discount: Annotated[float, Field(gt=0, lt=1)] = 0.99
+
+
 class TrainSpec(Strict):
     """One way to train; the defaults are those of the small recipe.
 
     begin     the recipe whose checkpoint is trained on, None: from the beginning
-    dropout   of conditional planners, share of the windows shown without their label
+    returns   condition the planner on the return, for Recipe.returns to ask for the most; None: it knows of none
+    dropout   of planners conditioned on constraints or the return, share of the windows shown without their label
     """
 
     network: NetworkSpec | MlpSpec = NetworkSpec()
@@ -77,6 +87,7 @@ class TrainSpec(Strict):
     clip: Annotated[float, Field(gt=0)] | None = 1.0
     bf16: bool = True
     begin: str | None = None
+    returns: ReturnSpec | None = None
     dropout: Annotated[float, Field(gt=0, lt=1)] = 0.25
     inverse: InverseSpec | None = None
 
@@ -133,7 +144,9 @@ class Preset(Strict):
 class Recipe(Strict):
     """models/<task>/recipe.yaml
 
-    frame   limits: the data's limits to [-1, 1]; relative: windows relative to their first state (frames.py), for control
+    frame     limits: the data's limits to [-1, 1]; relative: windows relative to their first state (frames.py), for control
+    returns   weight of guidance towards the highest return, the same for all methods and presets, where the checkpoint is
+              conditioned on it: 0 asks for none, 1 is the conditioned estimate itself, others take two network calls a step
     """
 
     task: str
@@ -145,6 +158,7 @@ class Recipe(Strict):
     constraints: str
     demonstrations: DemonstrationSpec = DemonstrationSpec()
     train: dict[str, TrainSpec] = {}
+    returns: Annotated[float, Field(ge=0)] = 0.0
     presets: dict[str, Preset]
     paper_units: PaperUnits = PaperUnits()
 
@@ -154,6 +168,10 @@ class Recipe(Strict):
             stride = spec.network.stride
             if self.horizon % stride:
                 raise ValueError(f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride")
+            if spec.returns and self.frame != "relative":
+                raise ValueError(
+                    f"train.{name}.returns: for control tasks (frame: relative), whole plans earn nothing; leave it out"
+                )
         return self
 
     @model_validator(mode="after")
@@ -170,6 +188,8 @@ class Card(Strict):
     inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
     constraints   hash of the constraints that a conditional planner was trained for; None of the others
     observed      quantities that it is told, besides
+    returns  of a planner conditioned on the return: the discount, the reward a step that is told as -1 and as 1, the share of the
+             states with a label; None of the others
     linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
     """
 
@@ -195,6 +215,7 @@ class Card(Strict):
     inverse: dict[str, float] | None = None
     constraints: str | None = None
     observed: tuple[str, ...] = ()
+    returns: dict[str, float] | None = None
 
 
 def home() -> Path:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cdiff_cli.baselines import Conditional
 from cdiff_cli.calibrations import Chosen, Conditions, choose, read_calibrations
 from cdiff_cli.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.conditioning import Seeing, guided
+from cdiff_cli.conditioning import Seeing, calls_a_step, guided
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
@@ -22,15 +22,15 @@ from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.margins import tightened
 from cdiff_cli.methods import METHODS, Unconstrained, make_method
-from cdiff_cli.planning import Problem, check_feasible, network_denoiser
+from cdiff_cli.planning import Problem, check_feasible
 from cdiff_cli.rates import Rate
-from cdiff_cli.recipe import Card, Preset, Recipe, home, load_recipe, shown
+from cdiff_cli.recipe import Preset, Recipe, home, load_recipe, shown
 from cdiff_cli.spec import DYNAMICS_TOLERANCE, Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.tasks import Task, load_task
 from cdiff_cli.training import choose_device
+from cdiff_cli.trips import parse_state, random_pairs
 
 Array = NDArray[np.float64]
-RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
 VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
@@ -96,12 +96,12 @@ class Resolved:
         return lambda seen, present: self._guided(planner, telling([seen[name] for name in names], present).to(device))
 
     def _guided(self, planner: Checkpoint, told: torch.Tensor | None) -> Denoiser:
-        return guided(planner.net, self.settings["weight"], 1.0 if planner.frame is None else RELATIVE_LIMIT, told)
+        return guided(planner.net, self.settings["weight"], planner.limit, told)
 
     @property
     def calls_a_step(self) -> int:
-        """Network calls of a diffusion step: two where a guided planner is asked with its condition and without."""
-        return 2 if self.conditional is not None and self.settings["weight"] != 1.0 else 1
+        """Network calls of a diffusion step: two where the planner is asked with its condition and without."""
+        return calls_a_step(self.conditions.returns if self.conditional is None else self.settings["weight"])
 
     @property
     def acts(self) -> bool:
@@ -140,6 +140,7 @@ class Resolved:
             "method": {self.options.method: self.settings},
             "kernel": self.kernel,
             "extra_steps": self.conditions.extra_steps,
+            "returns": self.conditions.returns,
             "polish": self.preset.polish,
             "safety": self.preset.safety,
             "dynamics": bool(dynamics_of(self.problem.enforced)),
@@ -203,13 +204,13 @@ def resolve(options: Options) -> Resolved:
     device = choose_device(options.device)
     schedule = Schedule.cosine(recipe.n_steps)
     if hasattr(task, "denoiser"):
-        checkpoint, denoiser, normaliser = None, task.denoiser(schedule), Normaliser.identity(len(task.layout))
+        checkpoint, returns, denoiser, normaliser = None, 0.0, task.denoiser(schedule), Normaliser.identity(len(task.layout))
         normaliser = Normaliser(normaliser.centre, normaliser.scale * task.scale)
     else:
         where = options.checkpoint or shown(home() / "models" / task.name / f"{options.recipe}.safetensors")
         checkpoint = load_checkpoint(where, task.name, device)
-        limit = 1.0 if checkpoint.frame is None else RELATIVE_LIMIT
-        denoiser, normaliser = network_denoiser(checkpoint.net, limit), checkpoint.normaliser
+        returns = recipe.returns if checkpoint.card.returns else 0.0
+        denoiser, normaliser = guided(checkpoint.net, returns, checkpoint.limit), checkpoint.normaliser
         if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
             schedule = Schedule.cosine(checkpoint.card.n_steps)
     fitted, observable = checkpoint.dynamics if checkpoint else None, getattr(task, "observable", ())
@@ -231,7 +232,8 @@ def resolve(options: Options) -> Resolved:
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
     obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    conditions = _conditions(options, preset, settings, kernel, schedule.n_steps)
+    returns = 0.0 if isinstance(method, Conditional) else returns  # it asks for something else
+    conditions = _conditions(options, preset, settings, kernel, schedule.n_steps, returns)
     margins = _margins(options, preset, method, g, checkpoint, path, kinds, conditions)
     problem = Problem(task, horizon, denoiser, schedule, normaliser, g, tightened(obeyed, margins.margins), start, goal, device)
     check_feasible(problem)
@@ -241,7 +243,7 @@ def resolve(options: Options) -> Resolved:
     )
 
 
-def _conditions(options: Options, preset: Preset, settings: dict[str, Any], kernel: str, steps: int) -> Conditions:
+def _conditions(options: Options, preset: Preset, settings: dict[str, Any], kernel: str, steps: int, returns: float) -> Conditions:
     """How plans are made and followed, the options first, else the preset."""
     extra = options.extra_steps
     return Conditions(
@@ -257,6 +259,7 @@ def _conditions(options: Options, preset: Preset, settings: dict[str, Any], kern
         warm=preset.warm if options.warm is None else options.warm,
         action_noise=options.action_noise,
         env=tuple(sorted(options.env)),
+        returns=returns,
     )
 
 
@@ -345,56 +348,3 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
             raise CdiffError(f"--set: expected name=value such as rho=0.05, found {text!r}")
         pairs[key.strip()] = value.strip()
     return pairs
-
-
-def parse_state(flag: str, text: str | None, default: dict[str, float] | None, task: Any) -> Array | None:
-    """'0.3,-1.2' (the positions, at rest) or 'x=0.3,y=-1.2,vx=1' as a state [dim]; coordinates left out are 0."""
-    if text is None and default is None:
-        return None
-    values = dict(default or {}) if text is None else {}
-    for i, piece in enumerate((text or "").split(",") if text is not None else []):
-        name, equals, number = piece.rpartition("=")
-        name = name.strip() if equals else task.positions[i] if i < len(task.positions) else ""
-        if name not in task.layout:
-            raise CdiffError(
-                f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} as 0.3,-1.2 or x=0.3,y=-1.2'
-            )
-        try:
-            values[name] = float(number)
-        except ValueError:
-            raise CdiffError(f"{flag}: expected a number for {name}, found {number!r}") from None
-    missing = [name for name in task.positions if name not in values]
-    if missing:
-        raise CdiffError(f"{flag}: {', '.join(missing)} missing; give {','.join(task.positions)}, as {flag} 0.3,-1.2")
-    state = np.array([values.get(name, 0.0) for name in task.layout])
-    if not np.isfinite(state).all():
-        raise CdiffError(f"{flag}: expected finite numbers, found {text}")
-    return state
-
-
-def fastest(task: Any, g: Constraint) -> float:
-    """The speed that limits on the change of the positions allow, m/s."""
-    at = {task.layout.index(name) for name in task.positions}
-    own = [part.high for part in g.parts if isinstance(part, Rate) and part.norm and set(part.which.argmax(1).tolist()) == at]
-    return min(own, default=math.inf)
-
-
-def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
-    """n random feasible starts and goals [n, dim], at rest: both allowed by the constraints, and the shortest way between
-    them no faster over one horizon than 95 % of the data's windows.
-    """
-    rng, starts, goals = np.random.default_rng(seed), [], []
-    still = np.zeros(len(task.layout) - len(task.positions))
-    for _ in range(100_000):
-        pair = np.stack([np.concatenate((task.random_point(rng), still)) for _ in range(2)])
-        speed = task.path_length(*pair[:, :2]) / ((card.horizon - 1) * task.dt)
-        x = torch.from_numpy(pair)
-        levels = [level for part in g.parts if (level := getattr(part, "level", None)) is not None]
-        if speed > fastest(task, g):
-            continue
-        if speed <= card.data["speed_q95"] and all(bool((level(x) <= 0).all()) for level in levels):
-            starts.append(pair[0])
-            goals.append(pair[1])
-            if len(starts) == n:
-                return np.stack(starts), np.stack(goals)
-    raise CdiffError("no feasible pair of start and goal in 100000 draws: the constraints leave too little of the maze")

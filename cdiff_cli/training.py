@@ -14,14 +14,15 @@ import torch
 from torch import Tensor, nn
 
 from cdiff_cli.checkpoint import Checkpoint, Network, build, load_checkpoint, read_safetensors, save_checkpoint, write_safetensors
-from cdiff_cli.conditioning import Condition
-from cdiff_cli.data import Array, Progress, demonstrations, digest, load_dataset, load_inputs
+from cdiff_cli.conditioning import LABELS, Condition
+from cdiff_cli.data import Array, Progress, demonstrations, digest, load_dataset, load_inputs, load_rewards
 from cdiff_cli.diffusion import Schedule, Weighing, training_loss
 from cdiff_cli.dynamics import LinearDynamics, fit
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.examples import Data, Draw
 from cdiff_cli.inverse import fit_inverse
 from cdiff_cli.recipe import Recipe, TrainSpec, home, shown
+from cdiff_cli.returns import Returns
 from cdiff_cli.tasks import Task
 
 LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
@@ -76,14 +77,17 @@ def train(
     if size not in recipe.train:
         raise CdiffError(f'no recipe "{size}"{suggestion(size, recipe.train)}; {task.name} has {", ".join(recipe.train)}')
     spec = recipe.train[size]
-    if spec.network.conditions != (condition.entries if condition else 0):
-        wanted = f"conditions: {condition.entries} in its network" if condition else "--conditional FILE"
-        raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or add it')
+    entries = condition.entries if condition else LABELS if spec.returns else 0
+    if spec.network.conditions != entries or (condition and spec.returns):
+        wanted = f"conditions: {entries} in its network" if entries else "--conditional FILE"
+        wanted = "no --conditional FILE beside its returns" if condition and spec.returns else wanted
+        raise CdiffError(f'recipe "{size}" of {task.name}: expected {wanted}; choose another recipe or mend it')
     asked = recipe.demonstrations
     episodes = load_dataset(task, dataset) if dataset else demonstrations(task, asked.steps, asked.seed, on_data)
     source = dataset or f"cdiff/{task.name}-v0"
     inputs = load_inputs(task, source)  # before the long part: a dataset without them is refused at once
-    data = Data.of(task, recipe, spec, episodes, condition, seed)
+    returns = Returns.of(episodes, load_rewards(source, episodes), spec.returns.discount) if spec.returns else None
+    data = Data.of(task, recipe, spec, episodes, condition, seed, returns)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:
@@ -138,6 +142,7 @@ def train(
         "inverse": explained,
         "constraints": condition.sha256 if condition else None,
         "observed": condition.observed if condition else (),
+        "returns": returns.told(spec.returns.discount) if returns and spec.returns else None,
     }
     tensors = {f"net.{name}": value.half().cpu().contiguous() for name, value in state.ema.state_dict().items()} | data.tensors()
     if inverse is not None:
@@ -189,13 +194,17 @@ class _Fit:
         return cls(net, ema, optimiser, generator, spec, recipe.horizon, recipe.n_steps, device, seed, data_sha256)
 
     def begin(self, base: Checkpoint) -> None:
-        """Go on from the weights of a finished checkpoint of the same data and, but for the labels, the same network."""
+        """Go on from the weights of a finished checkpoint of the same data and, but for the labels, the same network: what its own
+        labels mean, of the return, is left behind.
+        """
         if base.card.data_sha256 != self.data_sha256:
-            raise CheckpointError(f"{base.path}: trained on other demonstrations; train it again, then this one")
+            first = f"train it on these first, with --recipe {base.card.recipe}"
+            raise CheckpointError(f"{base.path}: trained on other demonstrations, and this one begins from it; {first}")
         if base.card.network.model_copy(update={"conditions": self.spec.network.conditions}) != self.spec.network:
             raise CheckpointError(f"{base.path}: its network is not the one of this recipe, which begins from it; mend recipe.yaml")
+        weights = {name: value for name, value in base.net.state_dict().items() if not name.startswith("condition.")}
         for net in (self.net, self.ema):
-            net.load_state_dict(net.state_dict() | base.net.state_dict())
+            net.load_state_dict(net.state_dict() | weights)
 
     def advance(self, draw: Draw, schedule: Schedule, pinned: Tensor) -> float:
         """One optimiser step; returns the loss."""

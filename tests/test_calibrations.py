@@ -68,6 +68,7 @@ def test_a_preset_is_what_it_stands_for():
         {"warm": 0.3},
         {"action_noise": 0.1},
         {"env": ("collide=false",)},
+        {"returns": 2.0},
     ],
     ids=lambda change: next(iter(change)),
 )
@@ -135,3 +136,13 @@ def test_the_file_reads_well(tmp_path):
     assert "    settings: {'on': clean, rho: 0.5}\n" in text  # YAML 1.1 takes a bare on for true
     assert "    a: {margin: 0.1, median: 0.0, largest: 0.1}\n" in text
     assert yaml.safe_load(text)["calibrated"][0]["stem"] == "easy"
+
+
+def test_a_set_that_says_nothing_of_returns_is_of_plans_that_were_asked_for_none(tmp_path):
+    checkpoint = tmp_path / "small.safetensors"
+    path = write_calibration(checkpoint, made(0.1))
+    content = yaml.safe_load(path.read_text())
+    del content["calibrated"][0]["conditions"]["returns"]
+    path.write_text(yaml.safe_dump(content))
+    assert chosen(read_calibrations(checkpoint)) == (0.1, "exact")
+    assert chosen(read_calibrations(checkpoint), now(returns=2.0)) == (0.1, "other")

@@ -8,8 +8,9 @@ import pytest
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Projected, Unconstrained, make_method
 from cdiff_cli.planning import MARGIN, check_feasible, follow, plan
-from cdiff_cli.request import Options, needed_speed, parse_settings, parse_state, resolve
+from cdiff_cli.request import Options, needed_speed, parse_settings, resolve
 from cdiff_cli.tasks import load_task
+from cdiff_cli.trips import parse_state
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,11 @@ from cdiff_cli.errors import CdiffError, InfeasibleError, SpecError
 from cdiff_cli.metrics import rollout_metrics, unsafe_segments
 from cdiff_cli.projection import project
 from cdiff_cli.rates import Rate, Slowed, independent, limits
-from cdiff_cli.request import Options, fastest, resolve
+from cdiff_cli.request import Options, resolve
 from cdiff_cli.safediffuser import jacobian
 from cdiff_cli.spec import json_schema, load_constraints
 from cdiff_cli.tasks import load_task
+from cdiff_cli.trips import fastest
 from tests.problems import F64, LAYOUT, ball, free_projection, half_space, normal, pin, qp_projection, waypoints
 from tests.test_cli import cdiff
 from tests.test_segments import segments

@@ -23,6 +23,7 @@ from cdiff_cli.training import choose_device, data_statistics, train
 
 MODELS = Path(__file__).parent.parent / "models"
 SHIPPED = sorted(MODELS.glob("*/small.safetensors"))
+BASES = sorted(MODELS.glob("*/plain.safetensors"))
 CPU = torch.device("cpu")
 TINY = TrainSpec(
     network=NetworkSpec(width=8, multipliers=(1, 2)), steps=8, batch=4, accumulate=2, bf16=False
@@ -305,14 +306,17 @@ def test_install_keeps_the_previous_checkpoint(whole, tmp_path, monkeypatch):
     assert len(list(folder.iterdir())) == 4
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", [*SHIPPED, *BASES], ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_shipped_checkpoint_loads_is_small_and_its_card_holds(path):
     checkpoint = load_checkpoint(path, path.parent.name)
     own = load(path.parent / "recipe.yaml", Recipe)
     assert path.stat().st_size <= 10 * 2**20
     assert checkpoint.card.weights_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert (checkpoint.card.horizon, checkpoint.card.n_steps) == (own.horizon, own.n_steps)
-    assert checkpoint.card.network == own.train["small"].network
+    assert checkpoint.card.network == own.train[path.stem].network
+    assert bool(checkpoint.card.returns) == bool(own.train[path.stem].returns)
+    base = own.train[path.stem].begin
+    assert base is None or load_checkpoint(path.with_name(f"{base}.safetensors")).card.data_sha256 == checkpoint.card.data_sha256
     assert checkpoint.demonstrations.shape[1:] == (own.horizon, len(load_task(path.parent.name).layout))
     assert all(p.isfinite().all() for p in checkpoint.net.parameters())
 

@@ -3,7 +3,7 @@
     python tests/benchmarks/mixed_gaits.py FOLDER [--task hopper] [--episodes 30] [--seed 100]
 
 FOLDER gets models, constraints and demonstrations of its own, the limits being the 95 and 90 % quantiles of these; a training
-broken off there goes on. About a quarter of an hour on one core. `returns.py --folder FOLDER` goes on from what it leaves.
+broken off there goes on. About a quarter of an hour on one core.
 """
 
 import argparse
