@@ -19,7 +19,7 @@ PAPER = (
     *("jump", "torn", "wall", "calls"),
 )
 FEW = ("distance", "wall", "residual", "effort", "safe_segments", "safe_executed", "success")
-SAFETY = (*runs.SAFETY_TABLE[:-2], "distance")
+SAFETY = (*runs.SAFETY_TABLE[:-2], "torn", "distance")
 BRIEF = ("distance", "violation_paper", "unsafe_segments", "torn", "wall")
 IN_BRIEF = ("reward", "violation_rate", "executed_violation", "safe_executed", "fell")
 CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
