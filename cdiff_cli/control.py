@@ -15,17 +15,17 @@ from cdiff_cli.affine_rows import AffineRows
 from cdiff_cli.baselines import BestOf
 from cdiff_cli.condensed import condensed
 from cdiff_cli.conditioning import Seeing
-from cdiff_cli.constraint import Constraint, Pins, Rows, Traj, pull_back
-from cdiff_cli.data import Normaliser
-from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, Step, sample
+from cdiff_cli.constraint import Constraint, Pins, pull_back
+from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, sample
 from cdiff_cli.episodes import Episodes, Log
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.frames import Frame
-from cdiff_cli.methods import AlmState, Unconstrained
+from cdiff_cli.methods import Unconstrained
 from cdiff_cli.networks import InverseDynamics
 from cdiff_cli.observed import Seen
 from cdiff_cli.planning import MARGIN, Timed, candidate_seed, synchronise
 from cdiff_cli.projection import project
+from cdiff_cli.resumed import Resumed, moved_on
 from cdiff_cli.tasks import ControlTask
 
 Array = NDArray[np.float64]
@@ -123,13 +123,13 @@ def control(
         log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
         alive, plans, since = np.arange(len(seeds)), np.empty((len(seeds), controller.horizon, states.shape[1])), 0
         shift = 0 if controller.warm is None else controller.execute
-        method, stuck, before = _Resumed(controller.method, shift), np.zeros(len(seeds), dtype=bool), alive
+        method, stuck, before = Resumed(controller.method, shift), np.zeros(len(seeds), dtype=bool), alive
         while log.done < total and len(alive):
             tau = log.done
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
                 goes_on = last is not None or controller.resume
-                method = _Resumed(controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None)
+                method = Resumed(controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None)
                 before, draws = alive, _draws(controller, [each for i in alive for each in generators[i]])
                 found = _plan(controller, method, _Asked(states[alive], log.now(alive), last, draws))
                 plans[alive] = found.x
@@ -177,47 +177,6 @@ def _in_units(denoiser: Denoiser, scale: Tensor) -> Denoiser:
     scale   [horizon, dim]
     """
     return lambda y, t: scale * denoiser(y / scale, t)
-
-
-@dataclass
-class _Resumed:
-    """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
-    to be found again in the few steps of a warm plan.
-
-    state   of the method after its last step; None to begin anew
-    """
-
-    method: Method
-    shift: int
-    state: Any = None
-
-    def init(self, x: Traj, g: Constraint) -> Any:
-        fresh, last = self.method.init(x, g), self.state
-        if isinstance(fresh, AlmState) and isinstance(last, AlmState):
-            return fresh._replace(lam=self._moved(fresh.lam, last.lam, g, x.shape[1]))
-        return self._moved(fresh, last, g, x.shape[1]) if isinstance(fresh, torch.Tensor) else fresh
-
-    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
-        x, self.state = self.method.step(step, g, state)
-        return x, self.state
-
-    def of(self, which: NDArray[np.bool_]) -> Any:
-        """The state of some of the episodes alone; multipliers that all share are theirs too."""
-        state, some = self.state, torch.from_numpy(which)
-        if isinstance(state, AlmState):
-            return state._replace(lam=state.lam[some] if len(state.lam) == len(some) else state.lam)
-        return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
-
-    def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on part by part, the new ones at the end as they begin."""
-        if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
-            return fresh
-        out, at = fresh.clone(), 0
-        for part in g.parts:
-            count = len(part.labels(horizon))
-            out[:, at : at + count - self.shift] = last[:, at + self.shift : at + count]
-            at += count
-        return out
 
 
 @dataclass(frozen=True)
@@ -312,7 +271,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         if last is not None:
             schedule = schedule.until(controller.redone)
             a = schedule.alpha_bar[-1]
-            first = a**0.5 * _moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
+            first = a**0.5 * moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
         y = sample(
             _in_units(timed, scale),
             schedule,
@@ -336,15 +295,6 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
             missed = (obeyed(torch.from_numpy(x)) > TOLERANCE).any(1).numpy()
     synchronise(device)
     return _Found(x, scored, missed, time.perf_counter() - began, timed.seconds)
-
-
-def _moved_on(to: Normaliser, last: Array, steps: int) -> Tensor:
-    """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
-    reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
-    """
-    y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - to.centre
-    y[:, -steps:] = 0.0
-    return y
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:

@@ -54,6 +54,7 @@ RANKS = {
     "calibrations": 3,
     "condensed": 3,
     "episodes": 8,
+    "resumed": 10,
     "control": 11,
     "control_figures": 12,
     "closed_loop": 15,

@@ -11,7 +11,7 @@ import torch
 from cdiff_cli import metrics
 from cdiff_cli.baselines import BestOf
 from cdiff_cli.constraint import Constraint, Waypoints
-from cdiff_cli.control import Controller, _Resumed, control
+from cdiff_cli.control import Controller, control
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import Schedule
 from cdiff_cli.episodes import Episodes
@@ -19,6 +19,7 @@ from cdiff_cli.frames import Frame
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
 from cdiff_cli.networks import InverseDynamics
+from cdiff_cli.resumed import Resumed
 from tests.problems import F64, chain, vec
 
 DT, H = 0.1, 6
@@ -278,8 +279,8 @@ def test_multipliers_go_on_from_plan_to_plan_where_that_is_asked_those_of_each_e
     control(replace(FREE, method=kept, resume=True), [0], steps=2)
     assert fresh.begun == [[0], [1], [2]] * 2
     assert kept.begun == [[0], [1], [2], [3], [4], [5]]
-    resumed = _Resumed(Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1))
-    some = _Resumed(Counting(), 0, resumed.of(np.array([True, False, True])))
+    resumed = Resumed(Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1))
+    some = Resumed(Counting(), 0, resumed.of(np.array([True, False, True])))
     assert some.init(torch.zeros(2, H, 2), LIMIT)[:, 0].tolist() == [1, 3]
 
 
