@@ -42,7 +42,7 @@ class Approach:
     def _sight(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """|y|, y / |y|, w and w along the line of sight, (y / |y|).w."""
         y = times(x, self.which.mT) - self.centre
-        length = y.norm(dim=-1).clamp_min(NEAREST)
+        length = torch.linalg.vector_norm(y, dim=-1).clamp_min(NEAREST)
         normal, rate = y / length[..., None], times(x, self.rates.mT) - self.drift
         return length, normal, rate, (normal * rate).sum(-1)
 

@@ -328,6 +328,8 @@ class Constraint:
     def __call__(self, x: Traj) -> Rows:
         if self.condensed is not None:
             return self.condensed(x)
+        if len(self.parts) == 1:
+            return self.parts[0](x)
         rows = [part(x) for part in self.parts]
         return torch.cat(rows, 1) if rows else x.new_zeros(len(x), 0)
 

@@ -245,7 +245,8 @@ def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows
 
 def zeros(x: Traj, g: Constraint, expectation: Expectation, planes: bool) -> Rows:
     """Multipliers of the rows of g, or where segments go round balls of those of their tangent planes."""
-    n = (turned(g, x, Pins.none(x)) if planes else g)(x).shape[1]
+    flat = turned(g, x, Pins.none(x)) if planes else g
+    n = len(g.labels(x.shape[1])) if flat is g else flat(x).shape[1]  # counted, not evaluated: a control step costs little else
     return x.new_zeros(1 if expectation == "batch_mean" else len(x), n)
 
 
