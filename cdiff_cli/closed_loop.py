@@ -163,7 +163,7 @@ def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -
     measured = metrics.control_metrics(done, levels, (space.low.astype(float), space.high.astype(float)))
     told = resolved.row()
     told["constraints"] = " ".join((told["constraints"], *resolved.options.env))  # what was met is part of what was asked
-    return [told | {"seed": seed} | values | {"calls": acting.calls} for seed, values in zip(resolved.seeds, measured, strict=True)]
+    return [told | {"seed": seed} | values for seed, values in zip(resolved.seeds, measured, strict=True)]
 
 
 def _write(path: Path, resolved: Resolved, acting: Controller, done: Episodes, rows: list[Row]) -> None:

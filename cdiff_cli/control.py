@@ -44,7 +44,7 @@ class Controller:
     ahead         waypoints between the states that the inverse dynamics model is asked about
     execute       environment steps a plan is followed
     warm          share of the diffusion steps done again on the last plan, moved on by what was executed, from the multipliers
-                  it ended with, moved on likewise; None: all, from noise
+                  it ended with, moved on likewise; None: all, from noise. Of constraints that are observed anew, see `watchful`
     resume        begin each plan from the multipliers that the last one ended with, as they are
     brake         state -> input that is used where the last projection leaves a plan outside of what it was to obey; None: the
                   plan's own
@@ -83,8 +83,16 @@ class Controller:
         return condensed(self.enforced, self.horizon, len(self.task.layout))
 
     @property
+    def watchful(self) -> bool:
+        """Whether what plans obey is observed anew at each control step. A warm plan that no longer obeys is then made anew, from
+        noise: gone on with, it keeps every push away from where the obstacle was, and slows down from plan to plan. No
+        multipliers are handed on.
+        """
+        return self.enforced.waits and not isinstance(self.method, Unconstrained | BestOf)
+
+    @property
     def redone(self) -> int:
-        """Diffusion steps a plan, the first of an episode apart where plans are warm."""
+        """Diffusion steps a plan, where plans are warm of those that go on from another."""
         return self.schedule.n_steps if self.warm is None else max(1, round(self.warm * self.schedule.n_steps))
 
     @property
@@ -94,8 +102,12 @@ class Controller:
 
     @property
     def calls(self) -> int:
-        """Network calls a control step at which plans are made."""
-        return self.tries * (self.redone + self.extra_steps) * self.calls_a_step
+        """Network calls a control step at which plans are made, where plans are warm and go on from another."""
+        return self.calls_of(self.redone)
+
+    def calls_of(self, steps: int) -> int:
+        """Network calls of plans made in that many diffusion steps."""
+        return self.tries * (steps + self.extra_steps) * self.calls_a_step
 
 
 def control(
@@ -128,12 +140,12 @@ def control(
             tau = log.done
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
-                goes_on = last is not None or controller.resume
+                goes_on = controller.resume or (last is not None and not controller.watchful)
                 method = Resumed(controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None)
                 before, draws = alive, _draws(controller, [each for i in alive for each in generators[i]])
                 found = _plan(controller, method, _Asked(states[alive], log.now(alive), last, draws))
                 plans[alive] = found.x
-                log.plan(tau, alive, found.x, found.g, found.total_s, found.network_s)
+                log.plan(tau, alive, found.x, found.g, found.calls, found.total_s, found.network_s)
                 stuck[alive] = found.missed
                 alive = log.end(log.diverged, alive, ~np.isfinite(found.x).all(axis=(1, 2)))
                 if not len(alive):
@@ -182,12 +194,13 @@ def _in_units(denoiser: Denoiser, scale: Tensor) -> Denoiser:
 @dataclass(frozen=True)
 class _Found:
     """Plans of one control step: x [n, horizon, dim], the constraint they were scored by, whether they miss what they were to
-    obey [n], times.
+    obey [n], network calls of each [n], times.
     """
 
     x: Array
     g: Constraint
     missed: NDArray[np.bool_]
+    calls: NDArray[np.int_]
     total_s: float
     network_s: float
 
@@ -228,13 +241,22 @@ def _plan(controller: Controller, method: Method, asked: _Asked) -> _Found:
     except InfeasibleError:
         if controller.brake is None:
             raise
-    scored, n = asked.bind(controller.g, controller), len(asked.states)
+    n = len(asked.states)
     if n == 1:
-        stay = asked.states[:, None].repeat(controller.horizon, 1)
-        return _Found(stay, scored, np.ones(1, dtype=bool), time.perf_counter() - began, 0.0)
-    each = [_plan(controller, controller.method, asked.of([i], asked.draws[i : i + 1])) for i in range(n)]
-    x, missed = np.concatenate([found.x for found in each]), np.concatenate([found.missed for found in each])
-    return _Found(x, scored, missed, time.perf_counter() - began, sum(found.network_s for found in each))
+        stay, one = asked.states[:, None].repeat(controller.horizon, 1), np.ones(1, dtype=int)
+        scored, spent = asked.bind(controller.g, controller), time.perf_counter() - began
+        return _Found(stay, scored, one.astype(bool), controller.calls * one, spent, 0.0)
+    return _apart(controller, asked, [np.array([i]) for i in range(n)])
+
+
+def _apart(controller: Controller, asked: _Asked, groups: Sequence[NDArray[np.intp]]) -> _Found:
+    """Plans made group by group, in the order of the episodes."""
+    began = time.perf_counter()
+    each = [_plan(controller, controller.method, asked.of(group, asked.draws[group])) for group in groups]
+    order = np.argsort(np.concatenate(groups))
+    x, missed, calls = (np.concatenate(column)[order] for column in zip(*((f.x, f.missed, f.calls) for f in each), strict=True))
+    scored = asked.bind(controller.g, controller)
+    return _Found(x, scored, missed, calls, time.perf_counter() - began, sum(found.network_s for found in each))
 
 
 def _best_of(controller: Controller, asked: _Asked) -> _Found:
@@ -245,7 +267,7 @@ def _best_of(controller: Controller, asked: _Asked) -> _Found:
     unsafe = many.bind(controller.enforced, controller)(torch.from_numpy(found.x)).clamp_min(0).sum(1).numpy()
     best = np.nan_to_num(unsafe, nan=np.inf).reshape(n, k).argmin(1) + k * np.arange(n)
     scored = asked.bind(controller.g, controller)
-    return _Found(found.x[best], scored, found.missed[best], found.total_s, found.network_s)
+    return _Found(found.x[best], scored, found.missed[best], found.calls[best], found.total_s, found.network_s)
 
 
 def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Found:
@@ -268,10 +290,16 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         begin = here[:, None] - to.centre
         schedule, first = controller.schedule, None
         noise = iter((scale * draws.to(device)).unbind(1))
-        if last is not None:
+        on = None if last is None else moved_on(to, last, controller.execute)
+        if on is not None and controller.watchful:
+            overtaken = (obeyed(torch.cat((here[:, None], (to.centre + on)[:, 1:]), 1)) > 0).any(1).numpy()
+            if overtaken.any() and not overtaken.all():
+                return _apart(controller, asked, [overtaken.nonzero()[0], (~overtaken).nonzero()[0]])
+            on = None if overtaken.all() else on
+        if on is not None:
             schedule = schedule.until(controller.redone)
             a = schedule.alpha_bar[-1]
-            first = a**0.5 * moved_on(to, last, controller.execute).to(like) + (1 - a) ** 0.5 * next(noise)
+            first = a**0.5 * on.to(like) + (1 - a) ** 0.5 * next(noise)
         y = sample(
             _in_units(timed, scale),
             schedule,
@@ -285,16 +313,18 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         )
         y64 = y.double().cpu()
         inside = obeyed if controller.condensed is None else replace(obeyed, condensed=controller.condensed)
-        if controller.polish and bool((inside(to.centre + y64) > -MARGIN).any()):
+        outside = controller.polish and bool((inside(to.centre + y64) > -MARGIN).any())
+        if outside:
             g64 = pull_back(obeyed.tighten(MARGIN), to.centre, unit)
             y64 = project(g64, y64, Pins(mask.cpu(), begin), strict=False)
         x = (to.centre + y64).numpy()
         x[:, 0] = states
         missed = np.zeros(len(x), dtype=bool)
-        if controller.polish and controller.brake is not None:
+        if outside and controller.brake is not None:
             missed = (obeyed(torch.from_numpy(x)) > TOLERANCE).any(1).numpy()
     synchronise(device)
-    return _Found(x, scored, missed, time.perf_counter() - began, timed.seconds)
+    calls = np.full(len(x), controller.calls_of(schedule.n_steps))
+    return _Found(x, scored, missed, calls, time.perf_counter() - began, timed.seconds)
 
 
 def _draws(controller: Controller, generators: Sequence[torch.Generator]) -> Tensor:

@@ -24,6 +24,7 @@ class Episodes:
     foreseen    value of each part's level at `planned`, on what was observed when it was planned [n, steps + 1, parts]
     observed    observed quantities by name, each [n, steps + 1]
     violation   sum over waypoints and rows of [g]_+ of each plan, as declared [n, steps], NaN where none was made
+    calls       network calls of each plan [n, steps], NaN where none was made
     braked      1 where the input was the task's brake, for want of a plan that obeys the constraints [n, steps]
     info        numbers that the environment told beside the reward, by name, each [n, steps]
     fell        whether the episode was ended by the environment [n]
@@ -38,6 +39,7 @@ class Episodes:
     foreseen: Array
     observed: dict[str, Array]
     violation: Array
+    calls: Array
     braked: Array
     info: dict[str, Array]
     fell: NDArray[np.bool_]
@@ -55,7 +57,8 @@ class Log:
         self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
         self.foreseen = np.full((n, steps + 1, parts), np.nan)
         self.observed = {name: np.full((n, steps + 1), np.nan) for name in task.observable}
-        self.violation, self.braked = np.full((n, steps), np.nan), np.zeros((n, steps))
+        self.violation, self.calls = (np.full((n, steps), np.nan) for _ in range(2))
+        self.braked = np.zeros((n, steps))
         self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         self.info: dict[str, Array] = {}
         self.latency: list[float] = []
@@ -71,8 +74,11 @@ class Log:
         for name, values in self.observed.items():
             values[which, tau] = [each[name] for each in observed]
 
-    def plan(self, tau: int, which: NDArray[np.intp], x: Array, g: Constraint, total_s: float, network_s: float) -> None:
+    def plan(
+        self, tau: int, which: NDArray[np.intp], x: Array, g: Constraint, calls: NDArray[np.int_], total_s: float, network_s: float
+    ) -> None:
         """Plans x [which, horizon, dim] made at step tau, g the constraint as it was then, environment units."""
+        self.calls[which, tau] = calls
         self.violation[which, tau] = g(torch.from_numpy(x)).clamp_min(0).sum(1).numpy()
         self.latency.append(total_s)
         self.network.append(network_s)
@@ -104,6 +110,7 @@ class Log:
             foreseen=self.foreseen,
             observed=self.observed,
             violation=self.violation,
+            calls=self.calls,
             braked=self.braked,
             info=self.info,
             fell=self.fell,

@@ -200,6 +200,7 @@ def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -
             "braked": 100.0 * float(episodes.braked[i, :count].mean()) if count else 0.0,
             "saturation": 100.0 * float(saturated[i, :count].mean()) if count else math.nan,
             "steps": float(count),
+            "calls": float(np.nanmean(episodes.calls[i])) if len(made) else math.nan,
             "latency_ms": 1e3 * float(np.median(episodes.latency_s)),
             "latency_p95": 1e3 * float(np.quantile(episodes.latency_s, 0.95)),
             "overhead": 100.0 * float(np.median(episodes.latency_s) / max(np.median(episodes.network_s), 1e-9) - 1.0),

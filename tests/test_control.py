@@ -19,6 +19,7 @@ from cdiff_cli.frames import Frame
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
 from cdiff_cli.networks import InverseDynamics
+from cdiff_cli.observed import Observed
 from cdiff_cli.resumed import Resumed
 from tests.problems import F64, chain, vec
 
@@ -260,6 +261,37 @@ def test_what_a_warm_plan_does_not_reach_goes_on_as_the_frame_foresees():
     began = seen[-1][1][0]
     assert (began[-2:] == 0).all()
     assert (began[1:-2].abs() > 0.01).any()
+
+
+def observed_limit() -> Constraint:
+    """v <= 0.75, told anew at each step."""
+
+    def make(seen, dt, horizon):
+        return Waypoints("speed", Affine(vec(0.0, 1.0), 0.75 + 0 * seen["clock"][:, None]))
+
+    return Constraint((Observed("speed", ("clock",), make),))
+
+
+def test_a_warm_plan_that_no_longer_obeys_what_is_observed_is_made_anew():
+    """Plans speed up by 0.1 a step from below 0.1, over five steps: the third or fourth is the first that comes to the limit."""
+    told = observed_limit()
+    acting = replace(FREE, method=Projected(), polish=True, warm=0.4, g=told, enforced=told)
+    done = control(acting, range(6), steps=5)
+    np.testing.assert_array_equal(done.calls[:, :2], [[3, 1]] * 6)
+    for i, start in enumerate(done.x[:, 0, 1]):
+        np.testing.assert_array_equal(done.calls[i, 2:], [3 if start > 0.05 else 1, 3, 3])
+    same(done, control(acting, [4], steps=5), slice(4, 5))
+    assert len(set(done.calls[:, 2])) == 2  # some of them together, some not
+    known = Constraint((Waypoints("speed", Affine(vec(0.0, 1.0), vec(0.75).squeeze())),))
+    for other in (replace(acting, g=known, enforced=known), replace(acting, method=Unconstrained(), polish=False)):
+        np.testing.assert_array_equal(control(other, [0], steps=5).calls, [[3, 1, 1, 1, 1]])
+
+
+def test_multipliers_do_not_outlast_what_is_observed():
+    counts = Counting()
+    told = observed_limit()
+    control(replace(FREE, method=counts, warm=0.4, g=told, enforced=told), [0], steps=4)
+    assert counts.begun == [[0], [1], [2], [0], *[[0], [1], [2]] * 2]
 
 
 class Counting:
