@@ -57,23 +57,19 @@ class Tracking(NamedTuple):
         return out.transpose(0, 1).reshape(batch, -1)[:, : steps * width].view(f.shape)
 
     def between(self, at: Tensor, weight: Tensor) -> Tensor:
-        """c_i K c_j for rows c = sum over l of weight[.., l] times the unit vector of entry at[.., l] of w, all of one row at
-        one step: at, weight [batch, k, l] -> [batch, k, k].
+        """c_i K c_j for rows c = sum over l of weight[l] times the unit vector of entry at[l] of w, all of one row at one step:
+        at, weight [l, batch, k] -> [batch, k, k].
         """
-        _, p, rank = self.far.shape
-        batch, k, terms = at.shape
-        piece = at[..., 0] // p
-        rows = self.near.flatten(0, 1)[at]  # [batch, k, l, p]
-        ends = self.far.flatten(0, 1)[at]
-        if terms > 1:
-            rows, ends = (rows * weight[..., None]).sum(2), (ends * weight[..., None]).sum(2)
-        else:
-            rows, ends = rows[:, :, 0] * weight, ends[:, :, 0] * weight
-        columns = (at % p).flatten(1)[:, None].expand(-1, k, -1)
-        inside = rows.gather(2, columns).view(batch, k, k, terms)
-        inside = (inside * weight[:, None]).sum(3) if terms > 1 else inside[..., 0] * weight[..., 0][:, None]
+        (pieces, p, rank), (terms, batch, k) = self.far.shape, at.shape
+        piece = at[0] // p
+        rows, ends = (
+            sum(v.flatten(0, 1).index_select(0, one.flatten()).view(batch, k, -1) * by[..., None] for one, by in zip(at, weight, strict=True))
+            for v in (self.near, self.far)
+        )
+        columns = at - piece * p
+        inside = sum(rows.gather(2, one[:, None].expand(-1, k, -1)) * by[:, None] for one, by in zip(columns, weight, strict=True))
         inside = torch.where(piece[:, :, None] == piece[:, None], inside, 0.0)
-        spread = ends.new_zeros(batch, k, len(self.link) // rank, rank)
+        spread = ends.new_zeros(batch, k, pieces, rank)
         spread.scatter_(2, piece[..., None, None].expand(-1, -1, 1, rank), ends[:, :, None])
         spread = spread.flatten(2)
         return inside + spread @ self.link @ spread.mT
