@@ -190,10 +190,12 @@ def _at_active(track: Tracking, at: Open, bounds: Bounds) -> tuple[Tensor, Tenso
     k = int(count.amax())
     slot = plan * k + torch.arange(len(found), device=y.device) - (count.cumsum(0) - count).index_select(0, plan)  # with padding
     up = at.active.flatten().index_select(0, found) > 0
-    limit = torch.where(up, *(end.flatten().index_select(0, found) for end in (at.high, at.low)))
+    high, low = (end.flatten().index_select(0, found) for end in (at.high, at.low))
     own = found + (terms - 1) * rows * plan  # of the row's first slope
     slopes = [at.slope.flatten().index_select(0, own + i * rows) for i in range(terms)]
-    numbers = torch.stack((at.value0.flatten().index_select(0, found) - limit, give.index_select(0, row), *slopes))
+    numbers = torch.stack(
+        (at.value0.flatten().index_select(0, found) - torch.where(up, high, low), give.index_select(0, row), *slopes)
+    )
     padded = y.new_zeros(2 + terms, batch * k)
     padded[1] = 1.0
     wanted, give, *_ = padded.index_copy_(1, slot, numbers).view(-1, batch, k)

@@ -32,7 +32,9 @@ from cdiff_cli.rates import Rate, Slowed, independent
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
-REFINEMENTS = 3  # choices of the tangent planes; within sampling one: later ones change the finished plan's distance by at most 0.8 %
+REFINEMENTS = (
+    3  # choices of the tangent planes; within sampling one: later ones change the finished plan's distance by at most 0.8 %
+)
 ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (reaching.py)
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 FINER = 30  # what ADMM asks of a projection within it, over its own tolerance

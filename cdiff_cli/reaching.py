@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.active_set import Bounds, settle
-from cdiff_cli.constraint import Constraint, Pins, Segments, Traj, Waypoints
+from cdiff_cli.constraint import Pins, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.levels import Affine
-from cdiff_cli.segments import NEVER, planes
+from cdiff_cli.segments import NEVER, crossed, planes
 from cdiff_cli.tracking import tracking
 
 RHO, RELAXATION = 50.0, 1.6  # of ADMM, for what has a projection but no rows
@@ -70,9 +70,8 @@ def nearest_reachable(
     slots, x = _slots(parts), z.double()
     if warm is None or warm.active.shape != (batch, horizon - 1, m + slots):
         active = torch.zeros(batch, horizon - 1, m + slots, dtype=torch.int8, device=z.device)
-        warm = Warm(
-            active, dynamics.inputs(z).double(), held.values, torch.zeros_like(held.values), torch.zeros_like(z[:, 0, 0]).bool()
-        )
+        u, soft = x.new_zeros(batch, horizon - 1, m), torch.zeros(batch, dtype=torch.bool, device=z.device)
+        warm = Warm(active, u, held.values, torch.zeros_like(held.values), soft)
     if batch == 0 or horizon == 1:
         return z, warm
     heavy = tuple(v + RHO * (rest is not None and i in used) for i, v in enumerate(weight.tolist()))
@@ -80,13 +79,13 @@ def nearest_reachable(
     track = tracking(numbers, heavy, horizon - 1, bool(pins.mask[-1].all()), z.device)
     active, _, copy, push, soft = warm
     active, soft = active.clone(), soft.clone()
-    g, at, free = Constraint(tuple(parts)), held.values, ~held.mask[1:].any(1)
+    at, free = held.values, ~held.mask[1:].any(1)
     rows = Bounds(dynamics.low.double(), dynamics.high.double(), where, max(tolerance, 1e-9))
     a = x.new_zeros(batch, horizon - 1, slots, len(where))
     b = x.new_full((batch, horizon - 1, slots), NEVER)
     walled = torch.zeros(batch, dtype=torch.bool, device=z.device)
     every = torch.arange(batch, device=z.device)
-    touched, some, w, w0 = (g(at) > 0).any(1), every, x.new_zeros(batch, horizon - 1, n + m), x
+    touched, some, w, w0 = crossed(parts, at), every, x.new_zeros(batch, horizon - 1, n + m), x
     for k in range(rounds if rest else turns + 1):
         if bool(touched.any()):
             which = touched.nonzero()[:, 0]
@@ -100,7 +99,7 @@ def nearest_reachable(
         active[..., m:] *= b < NEVER  # a warm start may know rows that are not there now
         w[some], active[some], soft[some] = settle(track, w0[some], rows, a[some], b[some], active[some], soft[some])
         at = torch.cat((held.values[:, :1], w[..., where]), 1)
-        unsafe = (g(at) > rows.tolerance).any(1)
+        unsafe = crossed(parts, at, rows.tolerance)
         if rest:
             over = RELAXATION * at + (1 - RELAXATION) * copy + push
             copy = rest(over, held)

@@ -50,17 +50,17 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     return a.permute(1, 3, 2, 0), b.transpose(1, 2)
 
 
-def crossed(parts: Sequence[Waypoints | Segments], x: Traj) -> Tensor:
-    """Which trajectories violate one of the parts, those that planes() takes [batch]."""
+def crossed(parts: Sequence[Waypoints | Segments], x: Traj, tolerance: float = 0.0) -> Tensor:
+    """Which trajectories violate one of the parts, those that planes() takes, by more than the tolerance [batch]."""
     found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     for part in parts:
         level = part.level
         if isinstance(level, Affine):
-            found |= (level(x) > 0).any(1)
+            found |= (level(x) > tolerance).any(1)
         else:
             assert isinstance(level, Ellipsoid)
             y = ahead(level.scaled(x))
-            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1).any(1)
+            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1 - tolerance / level.m).any(1)
     return found
 
 
@@ -72,7 +72,7 @@ def goes_round(part: Part) -> TypeGuard[Segments]:
 @dataclass(frozen=True)
 class Turned:
     """A constraint in which half-spaces of tangent planes stand for the parts that go round balls: the rows of the other parts,
-    then m times one of each waypoint, those of the segments before it and those after it, in the parts' own units; -1 where there is
+    then for each ball those of the segments before each waypoint, and of those after it, in the parts' own units; -1 where there is
     no such segment.
 
     rest   the other parts

@@ -5,9 +5,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cdiff_cli.active_set import AGAIN, Bounds, _at_active, settle
 from cdiff_cli.constraint import Segments, Waypoints
 from cdiff_cli.levels import Affine
-from cdiff_cli.active_set import AGAIN, Bounds, _at_active, settle
 from cdiff_cli.reaching import nearest_reachable
 from cdiff_cli.segments import planes
 from cdiff_cli.tracking import tracking
@@ -66,7 +66,9 @@ def test_a_warm_start_at_the_solution_takes_one_system_and_none_where_nothing_is
     _, warm = solve(d, z, pin(z, 0), [wall(2.0)])
     assert bool(warm.active.any())
     solved = []
-    monkeypatch.setattr("cdiff_cli.active_set._at_active", lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of))
+    monkeypatch.setattr(
+        "cdiff_cli.active_set._at_active", lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of)
+    )
     solve(d, z, pin(z, 0), [wall(2.0)], warm=warm)
     assert solved == [int(warm.active.flatten(1).any(1).sum())]
     solved.clear()
@@ -114,7 +116,9 @@ def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_s
     _, warm = solve(d, z, pin(z, 0, 63), [near])
     assert warm.soft.tolist() == [True]
     solved = []
-    monkeypatch.setattr("cdiff_cli.active_set._at_active", lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of))
+    monkeypatch.setattr(
+        "cdiff_cli.active_set._at_active", lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of)
+    )
     x, warm = solve(d, z + 1e-3, pin(z + 1e-3, 0, 63), [near], warm=warm, turns=3)
     assert len(solved) <= 1 + AGAIN
     assert warm.soft.tolist() == [True]
