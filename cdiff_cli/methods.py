@@ -21,7 +21,7 @@ import torch
 from torch.nn import functional as F
 
 from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
-from cdiff_cli.constraint import Constraint, Pins, Pull, Rows, Traj
+from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project
@@ -245,8 +245,8 @@ def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows
 
 def zeros(x: Traj, g: Constraint, expectation: Expectation, planes: bool) -> Rows:
     """Multipliers of the rows of g, or where segments go round balls of those of their tangent planes."""
-    flat = turned(g, x, Pins.none(x)) if planes else g
-    n = len(g.labels(x.shape[1])) if flat is g else flat(x).shape[1]  # counted, not evaluated: a control step costs little else
+    round_, rest = apart(g) if planes else ([], g)
+    n = len(rest.labels(x.shape[1])) + 2 * len(round_) * x.shape[1]  # counted, not evaluated; a waypoint ends two segments
     return x.new_zeros(1 if expectation == "batch_mean" else len(x), n)
 
 

@@ -30,13 +30,13 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     """
     m = sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
     batch, horizon, dim = x.shape
-    a, b = x.new_zeros(dim, m, batch, horizon), x.new_full((m, batch, horizon), NEVER)  # sums over few numbers are fast this way
-    rows, at = a.permute(1, 2, 3, 0), 0
+    a, b = x.new_zeros(dim, batch, m, horizon), x.new_full((batch, m, horizon), NEVER)  # sums over few numbers are fast this way
+    rows, bounds, at = a.permute(2, 1, 3, 0), b.transpose(0, 1), 0
     n = iter(_each_normals([part.level for part in parts if isinstance(part.level, Ellipsoid)], x, pins))
     for part in parts:
         level = part.level
         if isinstance(level, Affine):
-            rows[at], b[at] = level.a, level.b
+            rows[at], bounds[at] = level.a, level.b
             at += 1
             continue
         assert isinstance(level, Ellipsoid)
@@ -44,23 +44,23 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
         first, last = zip(each_end(level.which, 2), each_end(level.centre, 1), each_end(level.axes, 1), strict=True)
         before = _tangent(normal, *last)
         after = before if all(v is w for v, w in zip(first, last, strict=True)) else _tangent(normal, *first)
-        rows[at, :, 1:], b[at, :, 1:] = before  # of the segment before the waypoint
-        rows[at + 1, :, :-1], b[at + 1, :, :-1] = after
+        rows[at, :, 1:], bounds[at, :, 1:] = before  # of the segment before the waypoint
+        rows[at + 1, :, :-1], bounds[at + 1, :, :-1] = after
         at += 2
-    return a.permute(2, 3, 1, 0), b.permute(1, 2, 0)
+    return a.permute(1, 3, 2, 0), b.transpose(1, 2)
 
 
-def crossed(parts: Sequence[Waypoints | Segments], x: Traj) -> Tensor:
-    """Which trajectories violate one of the parts, those that planes() takes [batch]."""
+def crossed(parts: Sequence[Waypoints | Segments], x: Traj, tolerance: float = 0.0) -> Tensor:
+    """Which trajectories violate one of the parts, those that planes() takes, by more than the tolerance [batch]."""
     found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     for part in parts:
         level = part.level
         if isinstance(level, Affine):
-            found |= (level(x) > 0).any(1)
+            found |= (level(x) > tolerance).any(1)
         else:
             assert isinstance(level, Ellipsoid)
             y = ahead(level.scaled(x))
-            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1).any(1)
+            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1 - tolerance / level.m).any(1)
     return found
 
 
@@ -72,10 +72,11 @@ def goes_round(part: Part) -> TypeGuard[Segments]:
 @dataclass(frozen=True)
 class Turned:
     """A constraint in which half-spaces of tangent planes stand for the parts that go round balls: the rows of the other parts,
-    then of each waypoint those of the segments before and after it, in the parts' own units; -1 where there is no such segment.
+    then for each ball those of the segments before each waypoint, and of those after it, in the parts' own units; -1 where there is
+    no such segment.
 
     rest   the other parts
-    a, b   [batch, horizon, m, dim], [batch, horizon, m]
+    a, b   [dim, batch, m, horizon], [batch, m, horizon]
     """
 
     rest: Constraint
@@ -86,12 +87,12 @@ class Turned:
         return self.linearise(x)[0]
 
     def _values(self, x: Traj) -> Rows:
-        return ((self.a * x[:, :, None]).sum(-1) - self.b).flatten(1)
+        return ((self.a * x.movedim(-1, 0).contiguous()[:, :, None]).sum(0) - self.b).flatten(1)
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
         """As Constraint.linearise."""
-        parts, m = len(self.rest.parts), self.a.shape[2]
-        size = (parts + m) * self.a.square().sum(-1).flatten(1)
+        parts, m = len(self.rest.parts), self.b.shape[1]
+        size = (parts + m) * self.a.square().sum(0).flatten(1)
         if not parts:
             return self._values(x), self._pull, size
         rows, rest_pull, rest_size = self.rest.linearise(x)
@@ -100,7 +101,7 @@ class Turned:
         return torch.cat((rows, self._values(x)), 1), lambda w: rest_pull(w[:, :n]) + self._pull(w[:, n:]), every
 
     def _pull(self, w: Rows) -> Traj:
-        return (w.reshape(self.b.shape)[..., None] * self.a).sum(2)
+        return (w.reshape(self.b.shape) * self.a).sum(2).movedim(0, -1)
 
 
 def apart(g: Constraint) -> tuple[list[Segments], Constraint]:
@@ -115,11 +116,12 @@ def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint | Turned:
     if not round_:
         return g
     a, b = planes(round_, x, pins)
+    a, b = a.permute(3, 0, 2, 1), b.transpose(1, 2)
     for k, part in enumerate(round_):
         assert isinstance(part.level, Ellipsoid)
-        own, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[..., None]
-        a[:, :, own] *= m[..., None]
-        b[:, :, own] = torch.where(b[:, :, own] == NEVER, 1.0, m * b[:, :, own])
+        own, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[:, None]
+        a[:, :, own] *= m
+        b[:, own] = torch.where(b[:, own] == NEVER, 1.0, m * b[:, own])
     return Turned(rest, a, b)
 
 

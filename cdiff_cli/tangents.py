@@ -54,11 +54,10 @@ def _one_side(y: Tensor, pinned: Tensor) -> Tensor:
 def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: Tensor) -> Tensor:
     """Normals of the segments inside the sphere, along their runs, as normals_of() describes [segments inside, k]."""
     edges = pad(inside, (1, 1))
-    ends = (edges[:, 1:] != edges[:, :-1]).flatten().nonzero().view(-1, 2)  # waypoints where each run begins and stops
-    plan, tau = ends // y.shape[1], ends % y.shape[1]
-    at = y[plan, tau]  # [runs, 2, k]
-    into, out = at[:, 0], at[:, 1]
-    count, step = (ends[:, 1:] - ends[:, :1]), torch.arange(int((ends[:, 1] - ends[:, 0]).max()), device=y.device)
+    plan, tau = (edges[:, 1:] != edges[:, :-1]).nonzero().view(-1, 2, 2).unbind(2)  # waypoints where each run begins and stops
+    into, out = y[plan, tau].unbind(1)
+    count = tau[:, 1:] - tau[:, :1]
+    step = torch.arange(int(count.amax()), device=y.device)
     own = step < count  # the runs side by side, each padded to the longest [runs, longest]
     plan, segment = plan[:, :1], (tau[:, :1] + step).clamp_max(inside.shape[1] - 1)
     deepest = torch.where(own, distance[plan, segment], torch.inf).argmin(1, keepdim=True)
@@ -68,8 +67,9 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: 
     until = walked.cumsum(1)
     whole = until[:, -1:]
     share = torch.where(whole > 0, (until - walked / 2) / whole.clamp_min(1e-12), 0.5)  # at the middle of each segment
-    if y.shape[-1] == 2 and bool((nearest.square().sum(-1) > 1e-12).all() & (at.square().sum(-1) > 1e-12).all()):
-        return _turned_in_plane(into, nearest, out, share)[own]
+    turns = torch.stack((into, nearest, out))
+    if y.shape[-1] == 2 and float(turns.square().sum(-1).amin()) > 1e-12:
+        return _turned_in_plane(turns, share)[own]
 
     across = out - into
     along, e_in, e_out = _unit(torch.stack((across, into, out)), torch.stack((into, across, across)))
@@ -84,11 +84,10 @@ def _turning(y: Tensor, near: Tensor, distance: Tensor, length: Tensor, inside: 
     return angle.cos() * begin[half, run] + angle.sin() * side[half, run]
 
 
-def _turned_in_plane(into: Tensor, nearest: Tensor, out: Tensor, share: Tensor) -> Tensor:
-    """Unit vectors [runs, longest, 2] that turn from the direction of one point by way of the next to that of the last, [runs, 2]
-    each, evenly in share [runs, longest].
+def _turned_in_plane(points: Tensor, share: Tensor) -> Tensor:
+    """Unit vectors [runs, longest, 2] that turn from the direction of one point by way of the next to that of the last,
+    [3, runs, 2], evenly in share [runs, longest].
     """
-    points = torch.stack((into, nearest, out))
     direction = torch.atan2(points[..., 1], points[..., 0])[..., None]
     turn = direction[1:] - direction[:-1]
     turn = turn - 2 * math.pi * torch.round(turn / (2 * math.pi))  # the shorter way
@@ -110,23 +109,25 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 
 def _tangent_to_pins(n: Tensor, y: Tensor, pinned: Tensor) -> Tensor:
     """Turn the normals of segments with a pinned end so far that this end lies on the outer side."""
+    outside = pinned & (y.square().sum(-1) >= 1)
+    inner = ((n * end).sum(-1) < 1 for end in (y[:, :-1], y[:, 1:]))
+    if not bool((outside[:, :-1] & next(inner) | outside[:, 1:] & next(inner)).any()):
+        return n
     at = pinned.nonzero()[:, 0]
     for segment, end in ((at[at < n.shape[1]], 0), (at[at > 0] - 1, 1)):
-        normal = n[:, segment]  # a few of many
-        out = outwards(normal, y[:, segment + end])
-        if out is not normal:
-            n = n.index_copy(1, segment, out)
+        n = n.index_copy(1, segment, outwards(n[:, segment], y[:, segment + end]))  # a few of many
     return n
 
 
 def outwards(n: Tensor, at: Tensor, held: Tensor | None = None) -> Tensor:
     """Normals [..., k] turned so far that the points at, which lie outside, are on their outer side; held [..., 1], else all."""
-    length = at.norm(dim=-1, keepdim=True)
-    beyond = ((n * at).sum(-1, keepdim=True) < 1) & (length >= 1)
+    square = at.square().sum(-1, keepdim=True)
+    beyond = ((n * at).sum(-1, keepdim=True) < 1) & (square >= 1)
     if held is not None:
         beyond &= held
     if not bool(beyond.any()):
         return n
+    length = square.sqrt()
     e, cosine = at / length.clamp_min(1e-12), 1 / length.clamp_min(1.0)
     return torch.where(beyond, cosine * e + (1 - cosine**2).clamp_min(0).sqrt() * _perpendicular(e, n), n)
 

@@ -8,6 +8,7 @@ the batch. K is also the covariance of the closed loop that the Riccati recursio
 where they meet. Held as one dense block per PIECE steps and what passes between pieces, a product with it is linear in the horizon.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -57,26 +58,30 @@ class Tracking(NamedTuple):
         return out.transpose(0, 1).reshape(batch, -1)[:, : steps * width].view(f.shape)
 
     def between(self, at: Tensor, weight: Tensor) -> Tensor:
-        """c_i K c_j for rows c = sum over l of weight[.., l] times the unit vector of entry at[.., l] of w, all of one row at
-        one step: at, weight [batch, k, l] -> [batch, k, k].
+        """c_i K c_j for rows c = sum over l of weight[l] times the unit vector of entry at[l] of w, all of one row at one step:
+        at, weight [l, batch, k] -> [batch, k, k].
         """
-        _, p, rank = self.far.shape
-        batch, k, terms = at.shape
-        piece = at[..., 0] // p
-        rows = self.near.flatten(0, 1)[at]  # [batch, k, l, p]
-        ends = self.far.flatten(0, 1)[at]
-        if terms > 1:
-            rows, ends = (rows * weight[..., None]).sum(2), (ends * weight[..., None]).sum(2)
-        else:
-            rows, ends = rows[:, :, 0] * weight, ends[:, :, 0] * weight
-        columns = (at % p).flatten(1)[:, None].expand(-1, k, -1)
-        inside = rows.gather(2, columns).view(batch, k, k, terms)
-        inside = (inside * weight[:, None]).sum(3) if terms > 1 else inside[..., 0] * weight[..., 0][:, None]
+        (pieces, p, rank), (_, batch, k) = self.far.shape, at.shape
+        piece = at[0] // p
+        rows, ends = (
+            _weighed([v.flatten(0, 1).index_select(0, one.flatten()).view(batch, k, -1) for one in at], weight[..., None])
+            for v in (self.near, self.far)
+        )
+        columns = (at - piece * p)[:, :, None].expand(-1, -1, k, -1)
+        inside = _weighed([rows.gather(2, one) for one in columns], weight[:, :, None])
         inside = torch.where(piece[:, :, None] == piece[:, None], inside, 0.0)
-        spread = ends.new_zeros(batch, k, len(self.link) // rank, rank)
+        spread = ends.new_zeros(batch, k, pieces, rank)
         spread.scatter_(2, piece[..., None, None].expand(-1, -1, 1, rank), ends[:, :, None])
         spread = spread.flatten(2)
         return inside + spread @ self.link @ spread.mT
+
+
+def _weighed(terms: Sequence[Tensor], weight: Tensor) -> Tensor:
+    """The sum of terms, each times its weight."""
+    out = terms[0] * weight[0]
+    for term, by in zip(terms[1:], weight[1:], strict=True):
+        out.addcmul_(term, by)
+    return out
 
 
 @lru_cache(maxsize=8)

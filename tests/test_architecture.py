@@ -33,6 +33,7 @@ RANKS = {
     "spec_levels": 4,
     "dynamics": 3,
     "tracking": 0,
+    "active_set": 1,
     "reaching": 4,
     "diffusion": 3,
     "recipe": 3,

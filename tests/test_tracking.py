@@ -82,8 +82,8 @@ def test_entries_between_rows_are_those_of_the_matrix_and_it_is_symmetric(ends):
     step = torch.randint(steps, (3, 6, 1), generator=torch.Generator().manual_seed(0))
     at, weight = step * 5 + torch.tensor([0, 3]), normal(8, 3, 6, 2)
     C = torch.zeros(3, 6, steps * 5, dtype=F64).scatter_add_(2, at, weight)
-    torch.testing.assert_close(track.between(at, weight), C @ K @ C.mT, atol=1e-10 * scale, rtol=0)
-    alone = track.between(at[..., :1], weight[..., :1])
+    torch.testing.assert_close(track.between(at.movedim(2, 0), weight.movedim(2, 0)), C @ K @ C.mT, atol=1e-10 * scale, rtol=0)
+    alone = track.between(at[None, ..., 0], weight[None, ..., 0])
     C = torch.zeros_like(C).scatter_add_(2, at[..., :1], weight[..., :1])
     torch.testing.assert_close(alone, C @ K @ C.mT, atol=1e-10 * scale, rtol=0)
 

@@ -22,7 +22,6 @@ def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(see
     x = z + 0.3 * normal(seed + 1, 3, horizon, 2)
     rows, _, size = flat.linearise(x)
     assert rows.shape == (3, 2 * horizon)
-    rows, size = (v.unflatten(1, (horizon, 2)).mT.flatten(1) for v in (rows, size))  # before each waypoint, then after each
     missing = torch.zeros(2 * horizon, dtype=torch.bool)
     missing[[0, -1]] = True  # before the first waypoint, after the last
     torch.testing.assert_close(rows[:, missing], torch.full((3, int(missing.sum())), -1.0, dtype=F64))
