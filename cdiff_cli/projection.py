@@ -28,14 +28,13 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.rates import Rate, Slowed, independent
+from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
 REFINEMENTS = 3  # of the tangent planes; later ones change the distance by less than one in a hundred
 ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (reaching.py)
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
-FINER = 30  # what ADMM asks of a projection within it, over its own tolerance
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
@@ -66,7 +65,7 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     x, warm = nearest_reachable(
         part.dynamics,
         around,
-        _rest(rest, tolerance),
+        _rest(rest),
         part.decode(z),
         Pins(pins.mask, part.decode(pins.values.to(z))),
         used=used,
@@ -79,17 +78,8 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     return pins.paint(part.encode(x).to(kind)), warm
 
 
-def _rest(parts: Sequence[Part], tolerance: float) -> Callable[[Traj, Pins], Traj] | None:
+def _rest(parts: Sequence[Part]) -> Callable[[Traj, Pins], Traj] | None:
     """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
-    rates = [part for part in parts if isinstance(part, Rate)]
-    if rates and len(rates) == len(parts) and independent(rates):
-        slowed = Slowed(rates, Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
-
-        def slow(p: Traj, held: Pins) -> Traj:
-            slowed.pins = held
-            return slowed(p)
-
-        return slow
     return (lambda p, held: _project(Constraint(tuple(parts)), p, held, False)) if parts else None
 
 
@@ -139,7 +129,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
         rates = [part for part in others if isinstance(part, Rate)]
-        onto += [Slowed(each, pins) for each in ([rates] if independent(rates) else [[part] for part in rates]) if each]
+        onto += [Slowed(rates, pins)] if rates else []
         onto += [partial(exact, part, pins=pins) for part in others if not isinstance(part, Rate)]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
@@ -325,7 +315,8 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
 
 
 def _refuse_pinned_violations(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> None:
-    """A pinned state outside the set can never be repaired: say so before moving anything else."""
+    """Limits in contradiction, or a pinned state outside the set, can never be repaired: say so before moving anything else."""
+    refuse_contradiction([part for part in g.parts if isinstance(part, Rate)])
     if not bool(pins.mask.any()) or not g.parts or z.numel() == 0:
         return
     for part in g.parts:
