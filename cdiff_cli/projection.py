@@ -28,6 +28,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
+from cdiff_cli.pacing import nearest_paced
 from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
@@ -62,12 +63,21 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
     rest = [other for other in narrow if not tangible(other)]
+    rates = [other for other in rest if isinstance(other, Rate)]
+    target, held = part.decode(z), Pins(pins.mask, part.decode(pins.values.to(z)))
+    if rates and len(rates) == len(rest):
+        begin = None if warm is None else part.dynamics.rollout(target[:, 0], warm.u)
+        x, u = nearest_paced(
+            part.dynamics, around, rates, target, held, used=used, weight=part.weight, turns=REFINEMENTS, tolerance=tolerance, begin=begin
+        )
+        none = u.new_zeros(len(u), 0)
+        return pins.paint(part.encode(x).to(kind)), Warm(none, u, none, none, none)
     x, warm = nearest_reachable(
         part.dynamics,
         around,
         _rest(rest),
-        part.decode(z),
-        Pins(pins.mask, part.decode(pins.values.to(z))),
+        target,
+        held,
         used=used,
         weight=part.weight,
         rounds=ADMM_ROUNDS,
