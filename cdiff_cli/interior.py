@@ -4,24 +4,24 @@
 
 at each waypoint: half-spaces, bounds of inputs and of single rates are cones of length one, a bound of a length is a longer one
 (cones.py). Predictor and corrector by Mehrotra (1992) in the scaling of Nesterov and Todd; a Newton step is a linear-quadratic
-problem over the horizon (stages.py). It takes 10 to 20 steps whatever the limits are, where active sets that act on changes, many
-neighbours at once, take hundreds.
+problem over the horizon (stages.py). It takes 10 to 20 of them whatever the limits are, where active sets that act on changes,
+many neighbours at once, take hundreds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from cdiff_cli import cones, stages
-from cdiff_cli.dynamics import LinearDynamics
 
 STEPS = 50  # of Newton at most
 RIDGE = 1e-9  # on the inputs
 NEAR = 0.995  # share of the way to the boundary that a step goes
 BEGIN = 0.1  # how far within its cone a slack is at least, and its product with the multiplier, at the beginning
-SMALL = 1e-9  # mean product of slacks and multipliers, and residual, at which it ends
+SMALL = 1e-10  # mean product of slacks and multipliers, and largest residual, at which it ends
 STUCK = 1e-8  # share of a step from which no more is to be had
 
 
@@ -38,6 +38,10 @@ class Limits(NamedTuple):
         o[:, -1, :, 0] = 1.0
         return Limits(L, o)
 
+    def take(self, which: Tensor) -> "Limits":
+        """Of some trajectories of the batch alone."""
+        return Limits(*(v[which] if len(v) > 1 else v for v in self))
+
     def __call__(self, q: Tensor) -> Tensor:
         """[batch, horizon, c, k + 1]"""
         return self.o + self.forward(q)
@@ -48,6 +52,11 @@ class Limits(NamedTuple):
     def back(self, y: Tensor) -> Tensor:
         """L^T y [batch, horizon, n + m]"""
         return (y[..., None, :] @ self.L)[..., 0, :].sum(2)
+
+    def missed(self, q: Tensor) -> Tensor:
+        """How far q is out of the cones, negative where it is inside [batch]."""
+        s = self(q)
+        return (s[..., 1:].norm(dim=-1) - s[..., 0]).amax((1, 2))
 
 
 class Soft(NamedTuple):
@@ -63,8 +72,17 @@ class Soft(NamedTuple):
 HARD, YIELDING = Soft(1e-9, 1e-6, True), Soft(1e-7, 1e-4, False)
 
 
+class Iterate(NamedTuple):
+    """q, slacks and multipliers of each kind of limits, or a step of them; the multiplier of the last state [batch, n]."""
+
+    q: Tensor
+    s: list[Tensor]
+    y: list[Tensor]
+    push: Tensor
+
+
 class Moment(NamedTuple):
-    """Of one kind of limits at an iterate: its scaling, W y, by how much o + L q misses the slack, and how it gives way.
+    """Of one kind of limits at an iterate: its scaling, v = W y, by how much the slack differs from o + L q, and how it gives way.
 
     first, share   of (W^2 + soft e e^T)^-1 = W^-2 - share first first^T, first = W^-2 e, e = (1, 0)
     """
@@ -76,80 +94,110 @@ class Moment(NamedTuple):
     share: Tensor
 
     def solve(self, x: Tensor) -> Tensor:
-        return self.scaling.over_twice(x) - self.share * self.first * (self.first * x).sum(-1, keepdim=True)
+        return self.scaling.over_twice(x) - self.share * self.first * cones.dot(self.first, x)
 
     def curvature(self, L: Tensor) -> Tensor:
         """Sum of L^T (W^2 + soft e e^T)^-1 L   [batch, horizon, n + m, n + m]"""
-        columns = Moment(*(cones.Scaling(*(v[..., None, :] for v in self.scaling)), *(v[..., None, :] for v in self[1:])))
-        return L.flatten(2, 3).mT @ columns.solve(L.mT).mT.flatten(2, 3)
+        beta, v, w = (one[..., None, :] for one in self.scaling)
+        of_columns = self._replace(
+            scaling=cones.Scaling(beta, v, w), first=self.first[..., None, :], share=self.share[..., None, :]
+        )
+        return L.flatten(2, 3).mT @ of_columns.solve(L.mT).mT.flatten(2, 3)
 
 
 def nearest(
-    dynamics: LinearDynamics, limits: Sequence[Limits], z: Tensor, weight: Tensor, u: Tensor, end: Tensor, soft: Soft = HARD
-) -> tuple[Tensor, Tensor]:
-    """States [batch, horizon, n] nearest to z and the inputs that make them [batch, horizon - 1, m], begun at the inputs u.
+    A: Tensor, B: Tensor, limits: Sequence[Limits], z: Tensor, weight: Tensor, begin: Tensor, end: Tensor, soft: Soft = HARD
+) -> Tensor:
+    """The trajectory q = (x, u) [batch, horizon, n + m] within the limits whose x is nearest to z; the last u is idle.
 
+    begin   a trajectory that the dynamics make: its first state stays, what A and B do not say of the dynamics is taken from it
     weight  of each coordinate in the distance   [n]
     end     which coordinates of the last state are to be those of z   [n]
     """
-    n, m = dynamics.B.shape
-    batch, horizon, _ = z.shape
-    blocks = stages.blocks(dynamics)
+    (n, m), (batch, horizon, _) = B.shape, z.shape
+    blocks, target = stages.blocks(A, B), torch.cat((z, z.new_zeros(batch, horizon, m)), 2)
     W = torch.cat((weight, weight.new_full((m,), RIDGE))).repeat(horizon, 1)
-    W[-1, n:] = 1.0  # after the last state there is no input
+    W[-1, n:] = 1.0
     firm = torch.where(end, 1 / soft.end, 0.0).to(weight)
     heavy = W.clone()
     heavy[-1, :n] += firm
-    target = torch.cat((z, z.new_zeros(batch, horizon, m)), 2)
-    q = torch.cat((dynamics.rollout(z[:, 0], u), torch.nn.functional.pad(u, (0, 0, 0, 1))), 2)
-    push = torch.zeros_like(z[:, 0])
-    s = [_inside(each(q)) for each in limits]
-    y = [BEGIN * cones.flip(v) / cones.determinant(v) for v in s]
-    rank = horizon * sum(each.o.shape[2] for each in limits)
-    open_ = torch.ones(batch, 1, 1, dtype=torch.bool, device=z.device)
-
-    def far(ds: Sequence[Tensor], dy: Sequence[Tensor]) -> Tensor:
-        ways = [cones.way_out(v, d).flatten(1).amin(1) for v, d in zip((*s, *y), (*ds, *dy), strict=True)]
-        return torch.stack(ways).amin(0)[:, None, None]
-
+    slacks = [_inside(each(begin)) for each in limits]
+    at = Iterate(begin, slacks, [BEGIN * cones.flip(v) / cones.determinant(v) for v in slacks], torch.zeros_like(z[:, 0]))
+    todo = torch.ones(batch, dtype=torch.bool, device=z.device)
     for _ in range(STEPS):
-        now = [_moment(each, q, *pair, soft.limits) for each, *pair in zip(limits, s, y, strict=True)]
-        mu = sum((v * w).sum((1, 2, 3)) for v, w in zip(s, y, strict=True))[:, None, None] / rank
-        worst = torch.stack([one.miss.abs().amax((1, 2, 3)) for one in now]).amax(0)[:, None, None]
-        open_ = open_ & ((mu > SMALL) | (worst > SMALL))
-        if not bool(open_.any()):
+        now = [_moment(each, at.q, s, y, soft.limits) for each, s, y in zip(limits, at.s, at.y, strict=True)]
+        mu = _gap(at.s, at.y)
+        worst = torch.stack([one.miss.abs().amax((1, 2, 3)) for one in now]).amax(0)
+        todo = todo & ((mu > SMALL) | (worst > SMALL))
+        if not bool(todo.any()):
             break
-        H = sum(one.curvature(each.L) for one, each in zip(now, limits, strict=True))
+        H = torch.stack([one.curvature(each.L).expand(batch, -1, -1, -1) for one, each in zip(now, limits, strict=True)]).sum(0)
         H.diagonal(dim1=2, dim2=3).add_(heavy)
+        slope = W * (at.q - target)
+        slope[:, -1, :n] += firm * (at.q[:, -1, :n] - z[:, -1]) + at.push
+        for each, y in zip(limits, at.y, strict=True):
+            slope -= each.back(y)
         factors = stages.factor(blocks, H)
-        slope = W * (q - target) - sum(each.back(w) for each, w in zip(limits, y, strict=True))
-        slope[:, -1, :n] += firm * (q[:, -1, :n] - z[:, -1]) + push
+        step = _step(limits, now, slope, partial(stages.minimiser, blocks, factors), soft, at, mu)
+        share = (NEAR * _far(at, step)).clamp_max(1.0)
+        todo = todo & (share > STUCK) & step.q.isfinite().all(2).all(1)
+        push = firm * (at.q + step.q - target)[:, -1, :n] if soft.carried else torch.zeros_like(at.push)
+        at = _moved(at, step._replace(push=push), share, todo)
+    return at.q
 
-        def step(aims: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
-            pulls = [one.solve(one.miss + one.scaling.times(cones.quotient(aim, one.v))) for one, aim in zip(now, aims, strict=True)]
-            g = slope - sum(each.back(pull) for each, pull in zip(limits, pulls, strict=True))
-            d = stages.minimiser(blocks, factors, g)
-            ahead = [each.forward(d) for each in limits]
-            dy = [pull - one.solve(v) for one, pull, v in zip(now, pulls, ahead, strict=True)]
-            ds = [v - one.miss + soft.limits * _first(w) for one, v, w in zip(now, ahead, dy, strict=True)]
-            return d, ds, dy
 
-        here = [cones.product(one.v, one.v) for one in now]
-        _, ds, dy = step([-v for v in here])
-        a = far(ds, dy).clamp_max(1.0)[..., None]
-        left = sum(((v + a * dv) * (w + a * dw)).sum((1, 2, 3)) for v, dv, w, dw in zip(s, ds, y, dy, strict=True))
-        aim = mu * (left[:, None, None] / rank / mu).clamp(0.0, 1.0) ** 3
-        bends = [cones.product(one.scaling.over(dv), one.scaling.times(dw)) for one, dv, dw in zip(now, ds, dy, strict=True)]
-        d, ds, dy = step([aim[..., None] * _first(torch.ones_like(v)) - v - bend for v, bend in zip(here, bends, strict=True)])
-        a = (NEAR * far(ds, dy)).clamp_max(1.0)
-        open_ = open_ & (a > STUCK) & d.isfinite().all(2, keepdim=True).all(1, keepdim=True)
-        a = torch.where(open_, a, 0.0)
-        if soft.carried:
-            push = push + a[:, 0] * firm * (q + d - target)[:, -1, :n]
-        q = torch.where(open_, q + a * d, q)
-        s = [torch.where(open_[..., None], v + a[..., None] * dv, v) for v, dv in zip(s, ds, strict=True)]
-        y = [torch.where(open_[..., None], w + a[..., None] * dw, w) for w, dw in zip(y, dy, strict=True)]
-    return q[..., :n], q[:, :-1, n:]
+def _step(
+    limits: Sequence[Limits],
+    now: Sequence[Moment],
+    slope: Tensor,
+    minimiser: Callable[[Tensor], Tensor],
+    soft: Soft,
+    at: Iterate,
+    mu: Tensor,
+) -> Iterate:
+    """Mehrotra's step: what a step to products zero would do tells how far to aim, and the curvature on the way."""
+
+    def towards(aims: Sequence[Tensor]) -> Iterate:
+        pulls = [one.solve(one.miss + one.scaling.times(cones.quotient(aim, one.v))) for one, aim in zip(now, aims, strict=True)]
+        g = slope.clone()
+        for each, pull in zip(limits, pulls, strict=True):
+            g -= each.back(pull)
+        d = minimiser(g)
+        ahead = [each.forward(d) for each in limits]
+        dy = [pull - one.solve(v) for one, pull, v in zip(now, pulls, ahead, strict=True)]
+        ds = [v - one.miss + soft.limits * _first(w) for one, v, w in zip(now, ahead, dy, strict=True)]
+        return Iterate(d, ds, dy, at.push)
+
+    here = [cones.product(one.v, one.v) for one in now]
+    step = towards([-v for v in here])
+    share = _far(at, step).clamp_max(1.0)[:, None, None, None]
+    left = _gap(*([v + share * dv for v, dv in zip(*pair, strict=True)] for pair in ((at.s, step.s), (at.y, step.y))))
+    aim = (mu * (left / mu).clamp(0.0, 1.0) ** 3)[:, None, None, None]
+    bends = [cones.product(one.scaling.over(ds), one.scaling.times(dy)) for one, ds, dy in zip(now, step.s, step.y, strict=True)]
+    return towards([aim * _first(torch.ones_like(v)) - v - bend for v, bend in zip(here, bends, strict=True)])
+
+
+def _moved(at: Iterate, step: Iterate, share: Tensor, todo: Tensor) -> Iterate:
+    """The iterate after its share of the step, where there is something to do."""
+
+    def move(v: Tensor, d: Tensor) -> Tensor:
+        wide = (-1, *(1,) * (v.ndim - 1))
+        return torch.where(todo.view(wide), v + share.view(wide) * d, v)
+
+    s, y = ([move(v, d) for v, d in zip(*pair, strict=True)] for pair in ((at.s, step.s), (at.y, step.y)))
+    return Iterate(move(at.q, step.q), s, y, move(at.push, step.push))
+
+
+def _far(at: Iterate, step: Iterate) -> Tensor:
+    """The share of the step at which a slack or a multiplier leaves its cone [batch]."""
+    ways = [cones.way_out(v, d).flatten(1).amin(1) for v, d in zip((*at.s, *at.y), (*step.s, *step.y), strict=True)]
+    return torch.stack(ways).amin(0)
+
+
+def _gap(s: Sequence[Tensor], y: Sequence[Tensor]) -> Tensor:
+    """The mean product of slacks and multipliers [batch]."""
+    rank = sum(v.shape[1] * v.shape[2] for v in s)
+    return torch.stack([(v * w).sum((1, 2, 3)) for v, w in zip(s, y, strict=True)]).sum(0) / rank
 
 
 def _inside(s: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cdiff_cli.constraint import Constraint, Pins, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import LinearDynamics
-from cdiff_cli.interior import HARD, YIELDING, Limits, nearest
+from cdiff_cli.interior import YIELDING, Limits, nearest
 from cdiff_cli.levels import Affine
 from cdiff_cli.rates import Rate
 from cdiff_cli.segments import NEVER, planes
@@ -44,6 +44,8 @@ def nearest_paced(
     turns         times at most that tangent planes are chosen, first at `begin`, or z
     tolerance     violation of a part up to which its planes are not chosen anew
     """
+    if len(z) == 0 or z.shape[1] == 1:
+        return z, dynamics.inputs(z)
     where, last = list(used), pins.mask[-1]
     held, g = Pins(pins.mask[:, where], z[..., where]), Constraint(tuple(parts))
     free = ~held.mask.any(1)[:, None]
@@ -60,7 +62,7 @@ def nearest_paced(
             walls.L[touched], walls.o[touched] = slope, torch.where(there, b, 1.0)[..., None]
         walled = walled | touched
         limits = [*always, Limits(walls.L[todo], walls.o[todo])] if parts else always
-        x[todo], u[todo] = _within(dynamics, limits, z[todo], weight, 0.5 * dynamics.inputs(z[todo]), last)
+        x[todo], u[todo] = _within(dynamics, limits, z[todo], weight, last)
         unsafe = (g(x[..., where]) > tolerance).any(1)
         todo = touched = unsafe & ~walled | walled & (turn + 1 < turns)
         if not bool(todo.any()):
@@ -68,20 +70,43 @@ def nearest_paced(
     return x, u
 
 
-def _within(
-    dynamics: LinearDynamics, limits: Sequence[Limits], z: Tensor, weight: Tensor, u: Tensor, end: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The nearest trajectories within the limits; where there are none, goals and then limits give way."""
-    x, made = nearest(dynamics, limits, z, weight, u, end)
-    q = torch.cat((x, torch.nn.functional.pad(made, (0, 0, 0, 1))), 2)
-    slack = [each(q) for each in limits]
-    missed = torch.stack([(s[..., 1:].norm(dim=-1) - s[..., 0]).amax((1, 2)) for s in slack]).amax(0)
-    missed = torch.maximum(missed, torch.where(end, x[:, -1] - z[:, -1], 0.0).abs().amax(1))
+def paceable(rates: Sequence[Rate], pins: Pins) -> bool:
+    """Whether nearest_slowed takes these: rates in one frame, and as pins the start and perhaps the goal."""
+    return (
+        all(rate.scale.ndim == 1 for rate in rates) and pins.whole and bool(pins.held[:1].all()) and not bool(pins.held[1:-1].any())
+    )
+
+
+def nearest_slowed(parts: Sequence[Waypoints | Segments], rates: Sequence[Rate], z: Traj, pins: Pins, turns: int = 0) -> Traj:
+    """The trajectory nearest to z within the limits and around obstacles, of no dynamics: x' = x + u, of any u, makes every one."""
+    wide = pins.paint(z).double()
+    one, none = torch.eye(z.shape[2]).to(wide), wide.new_zeros(z.shape[2])
+    x, _ = nearest_paced(
+        LinearDynamics(one, one, none, none - torch.inf, none + torch.inf),
+        [part.to(wide) for part in parts],
+        [rate.to(wide) for rate in rates],
+        wide,
+        Pins(pins.mask, wide),
+        used=range(z.shape[2]),
+        weight=none + 1,
+        turns=turns,
+        tolerance=1e-9,
+    )
+    return pins.paint(x.to(z))
+
+
+def _within(dynamics: LinearDynamics, limits: Sequence[Limits], z: Tensor, weight: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest trajectories within the limits, and their inputs; where there are none, goals and then limits give way."""
+    n, u = z.shape[2], 0.5 * dynamics.inputs(z)
+    begin = torch.cat((dynamics.rollout(z[:, 0], u), torch.nn.functional.pad(u, (0, 0, 0, 1))), 2)
+    q = nearest(dynamics.A, dynamics.B, limits, z, weight, begin, end)
+    missed = torch.where(end, q[:, -1, :n] - z[:, -1], 0.0).abs().amax(1)
+    missed = torch.stack((missed, *(each.missed(q) for each in limits))).amax(0)
     soft = ~(missed < MISSED)
     if bool(soft.any()):
-        some = [Limits(*(v[soft] if len(v) == len(z) else v for v in each)) for each in limits]
-        x[soft], made[soft] = nearest(dynamics, some, z[soft], weight, u[soft], end, YIELDING)
-    return x, made
+        some = [each.take(soft) if len(z) > 1 else each for each in limits]
+        q[soft] = nearest(dynamics.A, dynamics.B, some, z[soft], weight, begin[soft], end, YIELDING)
+    return q[..., :n], q[:, :-1, n:]
 
 
 def _none(parts: Sequence[Waypoints | Segments], x: Tensor, u: Tensor) -> Limits:
@@ -99,10 +124,13 @@ def _always(dynamics: LinearDynamics, rates: Sequence[Rate], used: list[int], ho
     rows = [(-one[n:] / half[:, None], dynamics.high / half), (one[n:] / half[:, None], -dynamics.low / half)]
     lengths = []
     for rate in rates:
-        L, o = rate.which @ change / rate.dt, rate.which @ dynamics.c[used] / rate.dt
+        S = rate.which * rate.scale / rate.dt
+        L, o = S @ change, S @ dynamics.c[used]
         if rate.norm:
-            lengths.append((torch.cat((torch.zeros_like(L[:1]), L)), torch.cat((o.new_tensor([rate.high]), o))))
+            lengths.append((torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((o.new_tensor([rate.high]), o))[None]))
         else:
             rows += [(-L, rate.high - o), (L, o - rate.low)]
-    single = [(L[i : i + 1], o[i : i + 1]) for L, o in rows for i in range(len(L)) if bool(o[i].isfinite())]
-    return [Limits(*(torch.stack(v) for v in zip(*kind, strict=True))).of_steps(horizon) for kind in (single, *([one] for one in lengths)) if kind]
+    L, o = (torch.cat(v) for v in zip(*rows, strict=True))
+    there = o.isfinite()
+    single = [(L[there][:, None], o[there][:, None])] if bool(there.any()) else []
+    return [Limits(*each).of_steps(horizon) for each in (*single, *lengths)]

@@ -6,7 +6,9 @@ half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one sca
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression, or of high order a small QP (chains.py)
 limits on the rate of change between waypoints           ADMM on the differences (rates.py), convex
-linear dynamics with bounded inputs, and any of these    active set (reaching.py), ADMM for what has no rows; a local solution
+limits on rates around balls and ellipsoids              interior points (pacing.py), tangent planes as above
+linear dynamics with bounded inputs, and any of these    active set (reaching.py), with rates interior points, ADMM for what has
+                                                         no rows; a local solution
 several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
@@ -28,7 +30,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.pacing import nearest_paced
+from cdiff_cli.pacing import nearest_paced, nearest_slowed, paceable
 from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
@@ -68,7 +70,16 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     if rates and len(rates) == len(rest):
         begin = None if warm is None else part.dynamics.rollout(target[:, 0], warm.u)
         x, u = nearest_paced(
-            part.dynamics, around, rates, target, held, used=used, weight=part.weight, turns=REFINEMENTS, tolerance=tolerance, begin=begin
+            part.dynamics,
+            around,
+            rates,
+            target,
+            held,
+            used=used,
+            weight=part.weight,
+            turns=REFINEMENTS,
+            tolerance=tolerance,
+            begin=begin,
         )
         none = u.new_zeros(len(u), 0)
         return pins.paint(part.encode(x).to(kind)), Warm(none, u, none, none, none)
@@ -135,10 +146,13 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     others = [part for part in g.parts if not (sliding and tangible(part))]
     if not around and len(others) > 1 and pins.whole and (x := _onto_one(g, z, pins, tolerance)) is not None:
         return x
-    begin = z
+    begin, rates = z, [part for part in others if isinstance(part, Rate)]
+    paced = len(rates) == len(others) > 0 and paceable(rates, pins)
+    if around and paced:
+        begin = nearest_slowed(around, rates, z, pins, REFINEMENTS if strict else 1)
+        return begin if not strict or _holds(g, begin, pins) else _sequential(g, z, begin, pins, tolerance)
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
-        rates = [part for part in others if isinstance(part, Rate)]
         onto += [Slowed(rates, pins)] if rates else []
         onto += [partial(exact, part, pins=pins) for part in others if not isinstance(part, Rate)]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
@@ -150,6 +164,8 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             return x
         if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
+        if paced and _holds(g, x := nearest_slowed((), rates, z, pins), pins):
+            return x  # near to what the pins leave, ADMM takes more than its rounds
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
 

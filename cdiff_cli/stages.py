@@ -1,4 +1,4 @@
-"""Linear-quadratic problems over the horizon whose costs differ by waypoint and plan, by the Riccati recursion over blocks of steps.
+"""Linear-quadratic problems over the horizon, of other costs at each waypoint and plan: the Riccati recursion over blocks of steps.
 
     minimise over q = (x, u)   sum over waypoints of q.H q / 2 + g.q   s.t.  x' = A x + B u,  the first state zero
 
@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from cdiff_cli.dynamics import LinearDynamics
 
 BLOCK = 16  # steps
 
@@ -33,14 +31,14 @@ class Factors(NamedTuple):
     feedback: list[Tensor]
 
 
-def blocks(dynamics: LinearDynamics) -> Blocks:
-    n, m = dynamics.B.shape
-    unit = torch.eye(n + BLOCK * m).to(dynamics.A)
+def blocks(A: Tensor, B: Tensor) -> Blocks:
+    n, m = B.shape
+    unit = torch.eye(n + BLOCK * m).to(A)
     state, each = unit[:n], []
     for k in range(BLOCK):
         own = unit[n + k * m : n + (k + 1) * m]
         each.append(torch.cat((state, own)))
-        state = dynamics.A @ state + dynamics.B @ own
+        state = A @ state + B @ own
     return Blocks(torch.stack(each), state)
 
 
