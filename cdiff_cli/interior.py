@@ -21,7 +21,7 @@ STEPS = 50  # of Newton at most
 RIDGE = 1e-9  # on the inputs
 NEAR = 0.995  # share of the way to the boundary that a step goes
 BEGIN = 0.1  # how far within its cone a slack is at least, and its product with the multiplier, at the beginning
-SMALL = 1e-10  # mean product of slacks and multipliers, and largest residual, at which it ends
+SMALL = 1e-12  # mean product of slacks and multipliers, and largest residual, at which it ends
 STUCK = 1e-8  # share of a step from which no more is to be had
 
 
@@ -69,7 +69,7 @@ class Soft(NamedTuple):
     carried: bool
 
 
-HARD, YIELDING = Soft(1e-9, 1e-6, True), Soft(1e-7, 1e-4, False)
+HARD, YIELDING = Soft(1e-11, 1e-6, True), Soft(1e-7, 1e-4, False)
 
 
 class Iterate(NamedTuple):

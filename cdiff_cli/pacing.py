@@ -8,6 +8,7 @@ waypoint all of them are solved together (interior.py). Obstacles are half-space
 Where no trajectory is within all limits, goals give way first.
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -20,7 +21,7 @@ from cdiff_cli.levels import Affine
 from cdiff_cli.rates import Rate
 from cdiff_cli.segments import NEVER, planes
 
-MISSED = 1e-4  # of a limit, in its units: from there on the limits contradict each other
+MISSED = 1e-4  # of a limit, in shares of it, metres of a half-space: from there on they contradict each other
 
 
 def nearest_paced(
@@ -117,19 +118,22 @@ def _none(parts: Sequence[Waypoints | Segments], x: Tensor, u: Tensor) -> Limits
 
 
 def _always(dynamics: LinearDynamics, rates: Sequence[Rate], used: list[int], horizon: int) -> list[Limits]:
-    """Inputs within their bounds, in shares of half their range, with the rates of single coordinates; lengths of rates."""
+    """Inputs within their bounds, in shares of half their range, with the rates of single coordinates; lengths of rates. Rates in
+    shares of their larger limit.
+    """
     n, m = dynamics.B.shape
     one, half = torch.eye(n + m).to(dynamics.A), (dynamics.high - dynamics.low) / 2
     change = torch.cat((dynamics.A, dynamics.B), 1)[used] - one[used]
     rows = [(-one[n:] / half[:, None], dynamics.high / half), (one[n:] / half[:, None], -dynamics.low / half)]
     lengths = []
     for rate in rates:
-        S = rate.which * rate.scale / rate.dt
+        size = max((abs(v) for v in (rate.low, rate.high) if math.isfinite(v)), default=0.0) or 1.0
+        S = rate.which * rate.scale / (rate.dt * size)
         L, o = S @ change, S @ dynamics.c[used]
         if rate.norm:
-            lengths.append((torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((o.new_tensor([rate.high]), o))[None]))
+            lengths.append((torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((o.new_tensor([rate.high / size]), o))[None]))
         else:
-            rows += [(-L, rate.high - o), (L, o - rate.low)]
+            rows += [(-L, rate.high / size - o), (L, o - rate.low / size)]
     L, o = (torch.cat(v) for v in zip(*rows, strict=True))
     there = o.isfinite()
     single = [(L[there][:, None], o[there][:, None])] if bool(there.any()) else []
