@@ -10,24 +10,26 @@ Where no trajectory is within all limits, goals give way first.
 
 import math
 from collections.abc import Sequence
+from typing import TypeGuard, cast
 
 import torch
 from torch import Tensor
 
-from cdiff_cli.constraint import Constraint, Pins, Segments, Traj, Waypoints
+from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Segments, Traj, Waypoints
 from cdiff_cli.dynamics import LinearDynamics
 from cdiff_cli.interior import YIELDING, Limits, nearest
 from cdiff_cli.levels import Affine
 from cdiff_cli.rates import Rate
 from cdiff_cli.segments import NEVER, planes
 
+Pace = Rate | Chain
 MISSED = 1e-4  # of a limit, in shares of it, metres of a half-space: from there on they contradict each other
 
 
 def nearest_paced(
     dynamics: LinearDynamics,
     parts: Sequence[Waypoints | Segments],
-    rates: Sequence[Rate],
+    paces: Sequence[Pace],
     z: Traj,
     pins: Pins,
     *,
@@ -40,7 +42,7 @@ def nearest_paced(
     """The trajectory nearest to z, |x - z|^2 weighted by coordinate, that the dynamics produce from the first state of z within all
     limits, a pinned last state reached; and its inputs [batch, horizon - 1, m].
 
-    parts, rates  act on the coordinates `used` alone, in the units of z
+    parts, paces  act on the coordinates `used` alone, in the units of z
     weight        of each coordinate in the distance   [n]
     turns         times at most that tangent planes are chosen, first at `begin`, or z
     tolerance     violation of a part up to which its planes are not chosen anew
@@ -51,7 +53,7 @@ def nearest_paced(
     held, g = Pins(pins.mask[:, where], z[..., where]), Constraint(tuple(parts))
     free = ~held.mask.any(1)[:, None]
     x, u = (z if begin is None else begin).clone(), dynamics.inputs(z)
-    always, walls = _always(dynamics, rates, where, z.shape[1]), _none(parts, z, u)
+    always, walls = _always(dynamics, paces, where, z.shape[1]), _none(parts, z, u)
     todo = torch.ones(len(z), dtype=torch.bool, device=z.device)
     touched, walled = (g(x[..., where]) > 0).any(1), ~todo
     for turn in range(turns + 1):
@@ -71,21 +73,26 @@ def nearest_paced(
     return x, u
 
 
-def paceable(rates: Sequence[Rate], pins: Pins) -> bool:
-    """Whether nearest_slowed takes these: rates in one frame, and as pins the start and perhaps the goal."""
-    return (
-        all(rate.scale.ndim == 1 for rate in rates) and pins.whole and bool(pins.held[:1].all()) and not bool(pins.held[1:-1].any())
-    )
+def limits_steps(part: Part) -> TypeGuard[Pace]:
+    """Whether what the part asks is a convex limit of each step: of the two states that it joins."""
+    if isinstance(part, Chain):
+        return part.alpha2 is None and isinstance(part.acting, Affine) and part.acting.a.ndim == 1
+    return isinstance(part, Rate) and part.scale.ndim == 1
 
 
-def nearest_slowed(parts: Sequence[Waypoints | Segments], rates: Sequence[Rate], z: Traj, pins: Pins, turns: int = 0) -> Traj:
+def bounds_only(pins: Pins) -> bool:
+    """Whether the pins are the start and perhaps the goal, as nearest_slowed takes them."""
+    return pins.whole and bool(pins.held[:1].all()) and not bool(pins.held[1:-1].any())
+
+
+def nearest_slowed(parts: Sequence[Waypoints | Segments], paces: Sequence[Pace], z: Traj, pins: Pins, turns: int = 0) -> Traj:
     """The trajectory nearest to z within the limits and around obstacles, of no dynamics: x' = x + u, of any u, makes every one."""
     wide = pins.paint(z).double()
     one, none = torch.eye(z.shape[2]).to(wide), wide.new_zeros(z.shape[2])
     x, _ = nearest_paced(
         LinearDynamics(one, one, none, none - torch.inf, none + torch.inf),
         [part.to(wide) for part in parts],
-        [rate.to(wide) for rate in rates],
+        [pace.to(wide) for pace in paces],
         wide,
         Pins(pins.mask, wide),
         used=range(z.shape[2]),
@@ -117,23 +124,27 @@ def _none(parts: Sequence[Waypoints | Segments], x: Tensor, u: Tensor) -> Limits
     return Limits(x.new_zeros(*shape, x.shape[2] + u.shape[2]), x.new_ones(shape))
 
 
-def _always(dynamics: LinearDynamics, rates: Sequence[Rate], used: list[int], horizon: int) -> list[Limits]:
-    """Inputs within their bounds, in shares of half their range, with the rates of single coordinates; lengths of rates. Rates in
-    shares of their larger limit.
+def _always(dynamics: LinearDynamics, paces: Sequence[Pace], used: list[int], horizon: int) -> list[Limits]:
+    """Inputs within their bounds, in shares of half their range, with chains and the rates of single coordinates; lengths of rates.
+    Rates in shares of their larger limit.
     """
     n, m = dynamics.B.shape
     one, half = torch.eye(n + m).to(dynamics.A), (dynamics.high - dynamics.low) / 2
-    change = torch.cat((dynamics.A, dynamics.B), 1)[used] - one[used]
+    after = torch.cat((dynamics.A, dynamics.B), 1)[used]
     rows = [(-one[n:] / half[:, None], dynamics.high / half), (one[n:] / half[:, None], -dynamics.low / half)]
     lengths = []
-    for rate in rates:
-        size = max((abs(v) for v in (rate.low, rate.high) if math.isfinite(v)), default=0.0) or 1.0
-        S = rate.which * rate.scale / (rate.dt * size)
-        L, o = S @ change, S @ dynamics.c[used]
-        if rate.norm:
-            lengths.append((torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((o.new_tensor([rate.high / size]), o))[None]))
+    for pace in paces:
+        if isinstance(pace, Chain):
+            level, kept = cast(Affine, pace.acting), 1 - pace.alpha
+            rows.append(((level.a @ (kept * one[used] - after))[None], (pace.alpha * level.b - level.a @ dynamics.c[used])[None]))
+            continue
+        size = max((abs(v) for v in (pace.low, pace.high) if math.isfinite(v)), default=0.0) or 1.0
+        S = pace.which * pace.scale / (pace.dt * size)
+        L, o = S @ (after - one[used]), S @ dynamics.c[used]
+        if pace.norm:
+            lengths.append((torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((o.new_tensor([pace.high / size]), o))[None]))
         else:
-            rows += [(-L, rate.high / size - o), (L, o - rate.low / size)]
+            rows += [(-L, pace.high / size - o), (L, o - pace.low / size)]
     L, o = (torch.cat(v) for v in zip(*rows, strict=True))
     there = o.isfinite()
     single = [(L[there][:, None], o[there][:, None])] if bool(there.any()) else []

@@ -30,7 +30,7 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.pacing import nearest_paced, nearest_slowed, paceable
+from cdiff_cli.pacing import bounds_only, limits_steps, nearest_paced, nearest_slowed
 from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
@@ -65,14 +65,14 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
     rest = [other for other in narrow if not tangible(other)]
-    rates = [other for other in rest if isinstance(other, Rate)]
+    paces = [other for other in rest if limits_steps(other)]
     target, held = part.decode(z), Pins(pins.mask, part.decode(pins.values.to(z)))
-    if rates and len(rates) == len(rest):
+    if len(paces) == len(rest) > 0:
         begin = None if warm is None else part.dynamics.rollout(target[:, 0], warm.u)
         x, u = nearest_paced(
             part.dynamics,
             around,
-            rates,
+            paces,
             target,
             held,
             used=used,
@@ -147,9 +147,10 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     if not around and len(others) > 1 and pins.whole and (x := _onto_one(g, z, pins, tolerance)) is not None:
         return x
     begin, rates = z, [part for part in others if isinstance(part, Rate)]
-    paced = len(rates) == len(others) > 0 and paceable(rates, pins)
-    if around and paced:
-        begin = nearest_slowed(around, rates, z, pins, REFINEMENTS if strict else 1)
+    paces = [part for part in others if limits_steps(part)]
+    paced = bool(rates) and len(paces) == len(others) and bounds_only(pins)
+    if paced and (around or len(rates) < len(paces)):
+        begin = nearest_slowed(around, paces, z, pins, REFINEMENTS if strict else 1)
         return begin if not strict or _holds(g, begin, pins) else _sequential(g, z, begin, pins, tolerance)
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins)] if around else []
@@ -164,7 +165,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             return x
         if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
-        if paced and _holds(g, x := nearest_slowed((), rates, z, pins), pins):
+        if paced and _holds(g, x := nearest_slowed((), paces, z, pins), pins):
             return x  # near to what the pins leave, ADMM takes more than its rounds
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)

@@ -357,19 +357,26 @@ def test_a_plan_under_a_speed_limit_obeys_it_and_verifies(tmp_path):
     verify(run, code=0)
 
 
-THREE = """task: maze2d-umaze
-constraints:
-  - {name: disc, kind: quadratic, side: outside, centre: {x: 1.3, y: 0.0}, radius: 0.3}
-  - {name: speed, kind: rate, of: [x, y], max: 2.9}
-  - {name: sideways, kind: rate, of: x, min: -2.5, max: 2.5}
-  - {name: push, kind: rate, of: [vx, vy], max: 20.0}
-"""
+SEVERAL = {
+    "around a disc": [
+        {"name": "disc", "kind": "quadratic", "side": "outside", "centre": {"x": 1.3, "y": 0.0}, "radius": 0.3},
+        {"name": "speed", "kind": "rate", "of": ["x", "y"], "max": 2.9},
+        {"name": "sideways", "kind": "rate", "of": "x", "min": -2.5, "max": 2.5},
+        {"name": "push", "kind": "rate", "of": ["vx", "vy"], "max": 20.0},
+    ],
+    "with a chain": [
+        {"name": "brake", "kind": "dcbf", "alpha": 0.05, "barrier": {"kind": "linear", "a": {"x": 1.0}, "b": 1.45}},
+        {"name": "speed", "kind": "rate", "of": ["x", "y"], "max": 3.5},
+        {"name": "push", "kind": "rate", "of": "vy", "min": -20.0, "max": 20.0},
+    ],
+}
 
 
+@pytest.mark.parametrize("kind", SEVERAL)
 @pytest.mark.parametrize("option", [(), ("--no-dynamics",)])
-def test_several_limits_around_a_disc_are_obeyed_with_dynamics_and_without(option, tmp_path):
-    """At the shipped start and goal, where all of them bind."""
-    path = write(tmp_path, THREE)
+def test_several_limits_are_obeyed_with_dynamics_and_without(kind, option, tmp_path):
+    """At the shipped start and goal, where most of them bind."""
+    path = write(tmp_path, yaml.safe_dump({"task": "maze2d-umaze", "constraints": SEVERAL[kind]}))
     cdiff("plan", "--method", "alm", "--constraints", path, "--n", 2, "--steps", 8, "--runs", tmp_path / "runs", *option)
     (run,) = (tmp_path / "runs").iterdir()
     assert {entry["status"] for entry in json.loads((run / "certificate.json").read_text())["entries"]} == {"safe"}
