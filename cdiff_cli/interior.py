@@ -4,8 +4,7 @@
 
 at each waypoint: half-spaces, bounds of inputs and of single rates are cones of length one, a bound of a length is a longer one
 (cones.py). Predictor and corrector by Mehrotra (1992) in the scaling of Nesterov and Todd; a Newton step is a linear-quadratic
-problem over the horizon (stages.py). It takes 10 to 20 of them whatever the limits are, where active sets that act on changes,
-many neighbours at once, take hundreds.
+problem over the horizon (stages.py). On the mazes' plans it takes 13 to 31 of them, whatever the limits.
 """
 
 from collections.abc import Callable, Sequence
@@ -120,7 +119,7 @@ def nearest(
     W[-1, n:] = 1.0
     firm = torch.where(end, 1 / soft.end, 0.0).to(weight)
     heavy = W.clone()
-    heavy[-1, :n] += firm
+    heavy[-1, :n] += firm  # an augmented Lagrangian of the pinned last state, whose multiplier is at.push
     slacks = [_inside(each(begin)) for each in limits]
     at = Iterate(begin, slacks, [BEGIN * cones.flip(v) / cones.determinant(v) for v in slacks], torch.zeros_like(z[:, 0]))
     todo = torch.ones(batch, dtype=torch.bool, device=z.device)
