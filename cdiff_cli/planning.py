@@ -18,7 +18,7 @@ from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.methods import Unconstrained
 from cdiff_cli.observed import require_bound
 from cdiff_cli.projection import project, project_reachable
-from cdiff_cli.rates import Rate
+from cdiff_cli.rates import Rate, refuse_contradiction
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -77,6 +77,7 @@ def check_feasible(problem: Problem) -> None:
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
             _check_pin(problem, name, state, columns)
+    refuse_contradiction([part for part in problem.g.parts if isinstance(part, Rate)])
     for part in problem.g.parts:
         if isinstance(part, Rate) and problem.start is not None and problem.goal is not None:
             pins = make_pins(problem, len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu"))

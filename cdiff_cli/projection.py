@@ -6,7 +6,9 @@ half-space, ball, ellipsoid, any quadric at waypoints    closed form, or one sca
 segments outside balls and ellipsoids, with half-spaces  a tangent plane a segment (segments.py), then exact, a local solution
 control-barrier chain over a half-space or a ball        weighted isotonic regression, or of high order a small QP (chains.py)
 limits on the rate of change between waypoints           ADMM on the differences (rates.py), convex
-linear dynamics with bounded inputs, and any of these    active set (reaching.py), ADMM for what has no rows; a local solution
+limits on rates around balls and ellipsoids              interior points (pacing.py), tangent planes as above
+linear dynamics with bounded inputs, and any of these    active set (reaching.py), with rates interior points, ADMM for what has
+                                                         no rows; a local solution
 several of these together                                Dykstra's algorithm over the exact forms
 anything else                                            sequential linearisation, each QP by ProxQP (qpsolvers)
 """
@@ -28,16 +30,14 @@ from cdiff_cli.constraint import Chain, Constraint, Part, Pins, Rows, Segments, 
 from cdiff_cli.dynamics import dynamics_of, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.rates import Rate, Slowed, independent
+from cdiff_cli.pacing import bounds_only, limits_steps, nearest_paced, nearest_slowed
+from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
-REFINEMENTS = (
-    3  # choices of the tangent planes; within sampling one: later ones change the finished plan's distance by at most 0.8 %
-)
+REFINEMENTS = 3  # choices of the tangent planes; within sampling one: the others change a finished plan's distance by 0.8 % at most
 ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (reaching.py)
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
-FINER = 30  # what ADMM asks of a projection within it, over its own tolerance
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
 
 
@@ -65,12 +65,30 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     narrow = [_restricted(other.to(z).pull_back(*back), used) for other in others]
     around = cast(Any, [other for other in narrow if tangible(other)])
     rest = [other for other in narrow if not tangible(other)]
+    paces = [other for other in rest if limits_steps(other)]
+    target, held = part.decode(z), Pins(pins.mask, part.decode(pins.values.to(z)))
+    if len(paces) == len(rest) > 0:
+        begin = None if warm is None else part.dynamics.rollout(target[:, 0], warm.u)
+        x, u = nearest_paced(
+            part.dynamics,
+            around,
+            paces,
+            target,
+            held,
+            used=used,
+            weight=part.weight,
+            turns=REFINEMENTS,
+            tolerance=tolerance,
+            begin=begin,
+        )
+        none = u.new_zeros(len(u), 0)
+        return pins.paint(part.encode(x).to(kind)), Warm(none, u, none, none, none)
     x, warm = nearest_reachable(
         part.dynamics,
         around,
-        _rest(rest, tolerance),
-        part.decode(z),
-        Pins(pins.mask, part.decode(pins.values.to(z))),
+        _rest(rest),
+        target,
+        held,
         used=used,
         weight=part.weight,
         rounds=ADMM_ROUNDS,
@@ -81,17 +99,8 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
     return pins.paint(part.encode(x).to(kind)), warm
 
 
-def _rest(parts: Sequence[Part], tolerance: float) -> Callable[[Traj, Pins], Traj] | None:
+def _rest(parts: Sequence[Part]) -> Callable[[Traj, Pins], Traj] | None:
     """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
-    rates = [part for part in parts if isinstance(part, Rate)]
-    if rates and len(rates) == len(parts) and independent(rates):
-        slowed = Slowed(rates, Pins(torch.empty(0), torch.empty(0)), max(tolerance, 1e-6) / FINER)
-
-        def slow(p: Traj, held: Pins) -> Traj:
-            slowed.pins = held
-            return slowed(p)
-
-        return slow
     return (lambda p, held: _project(Constraint(tuple(parts)), p, held, False)) if parts else None
 
 
@@ -137,11 +146,15 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     others = [part for part in g.parts if not (sliding and tangible(part))]
     if not around and len(others) > 1 and pins.whole and (x := _onto_one(g, z, pins, tolerance)) is not None:
         return x
-    begin = z
+    begin, turns, rates = z, REFINEMENTS if strict else 1, [part for part in others if isinstance(part, Rate)]
+    paces = [part for part in others if limits_steps(part)]
+    paced = bool(rates) and len(paces) == len(others) and bounds_only(pins)
+    if paced and (around or len(rates) < len(paces)):
+        begin = nearest_slowed(around, paces, z, pins, turns)
+        return begin if not strict or _holds(g, begin, pins) else _sequential(g, z, begin, pins, tolerance)
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
-        onto = [lambda y: _around(around, y, pins, REFINEMENTS if strict else 1)] if around else []
-        rates = [part for part in others if isinstance(part, Rate)]
-        onto += [Slowed(each, pins) for each in ([rates] if independent(rates) else [[part] for part in rates]) if each]
+        onto = [lambda y: _around(around, y, pins, turns)] if around else []
+        onto += [Slowed(rates, pins)] if rates else []
         onto += [partial(exact, part, pins=pins) for part in others if not isinstance(part, Rate)]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
@@ -152,6 +165,8 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             return x
         if not bool((_free_rows(g, x, pins) > 100 * tolerance).any()):  # pinned ends can contradict a chain between them
             return x
+        if paced and _holds(g, x := nearest_slowed((), paces, z, pins), pins):
+            return x  # near to what the pins leave, ADMM takes more than its rounds
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
 
@@ -327,7 +342,8 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
 
 
 def _refuse_pinned_violations(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> None:
-    """A pinned state outside the set can never be repaired: say so before moving anything else."""
+    """Limits in contradiction, or a pinned state outside the set, can never be repaired: say so before moving anything else."""
+    refuse_contradiction([part for part in g.parts if isinstance(part, Rate)])
     if not bool(pins.mask.any()) or not g.parts or z.numel() == 0:
         return
     for part in g.parts:
