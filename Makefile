@@ -20,7 +20,7 @@ lint: .venv/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-tables: .venv/.ready  ## the tables of the README from runs/reference
+tables: .venv/.ready  ## the tables of README.md and docs/results.md from runs/reference
 	$(BIN)/python tests/readme_tables.py
 
 benchmark: .venv/.ready  ## timings, as ratios within one run

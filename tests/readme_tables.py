@@ -1,6 +1,7 @@
-"""The tables of the README, made from the rows in runs/reference/: `make tables` writes them, a test fails when they drift.
+"""The tables of the README and docs/results.md, made from the rows in runs/reference/: `make tables` writes them, a test fails when
+they drift.
 
-In the README a table stands between `<!-- table NAME -->` and `<!-- end -->`.
+A table stands between `<!-- table NAME -->` and `<!-- end -->`.
 """
 
 import re
@@ -12,6 +13,7 @@ from cdiff_cli import runs, tables
 
 ROOT = Path(__file__).parent.parent
 REFERENCE = ROOT / "runs" / "reference"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 PAPER = (
@@ -82,7 +84,7 @@ def filled(text: str) -> str:
 
 
 if __name__ == "__main__":
-    readme = ROOT / "README.md"
-    old = readme.read_text()
-    readme.write_text(filled(old))
-    sys.stderr.write("README.md: its tables are up to date\n" if filled(old) == old else "README.md: tables rewritten\n")
+    for page in PAGES:
+        old = page.read_text()
+        page.write_text(filled(old))
+        sys.stderr.write(f"{page.name}: its tables are up to date\n" if filled(old) == old else f"{page.name}: tables rewritten\n")
