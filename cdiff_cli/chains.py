@@ -17,6 +17,8 @@ from cdiff_cli.constraint import Chain, Pins, Rows, Traj
 from cdiff_cli.levels import Affine, Ellipsoid, times
 
 SHORT = 32  # indices up to which all blocks are written out at once
+WIDE = 8  # width of the windows round runs of falls from which on their search pays
+SWEEPS = 3  # of that search; what they leave, the next round takes
 FLIPS = 1000  # changes of the active set; a handful is usual
 LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
 NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
@@ -168,49 +170,93 @@ def pool_violators(h: Rows, gamma: float, weight: Tensor) -> tuple[Rows, int]:
 
         v = N / D,   N = sum_k w_k gamma^(k - s) h_k,   D = sum_k w_k gamma^(2 (k - s))
 
-    and the next block violates if its value is < gamma^length v. A round merges every run of consecutive violators, of all
-    plans at once. Powers count from the first index of the merged block: they are at most 1, the first is 1, and one that
-    underflows belongs to a term that no longer counts.
+    and the next block falls if its value is < gamma^length v. A round merges every run of falling blocks with the block before, of
+    all plans at once, and further neighbours where _reach finds some. Powers count from the first index of the merged block: they
+    are at most 1, the first is 1, and one that underflows belongs to a term that no longer counts.
 
-    Rounds (tests/benchmarks/chain.py): at gamma = 0.95 at most 17 for noise, random walks and smooth curves up to n = 1536; at
-    gamma = 0.999 and n = 384 noise takes 10, a walk 25, a smooth curve 47. The worst measured is a lone value far below the
-    end of a rise or far above its beginning, which takes in one neighbour a round: as many as n rounds, or about
-    log(distance) / log(1 / gamma) where that is fewer.
+    Rounds (tests/benchmarks/chain.py, batch 10, n = 384 and 1536): at gamma = 0.95 at most 8 for noise, 6 for random walks, 1 for
+    smooth curves; at gamma = 0.999 12, 11 and 4. The worst measured is a lone value far below the end of a rise or far above its
+    beginning: 1 at gamma = 0.95, 16 at gamma = 0.999 and n = 384, where the last blocks, too few for a window, go one a round.
 
     h [batch, n], weight [n] or [batch, n] > 0
     """
     batch, n = h.shape
-    power = _powers(gamma, n, h)
-    powers = torch.stack((power, power.square()))
-    sums = h.new_full((2, batch, n + 1), torch.nan)  # N and D of all plans on one line; a NaN between two violates nothing
-    sums[0, :, :n], sums[1, :, :n] = weight * h, weight
-    sums = sums.flatten(1)
-    index = torch.arange(sums.shape[1] + 1, device=h.device)
-    start, value, rounds = index, sums[0] / sums[1], 0  # start: of each block, then the end of the line
-    due = gamma * value  # what the next block has to reach
+    scales = _scales(gamma, n, h.dtype, h.device)
+    power = scales[n:]
+    value, D = h.new_full((2, batch * (n + 1) + 1), torch.nan)  # all plans on one line, a NaN at each end; beside it nothing falls
+    value[:-1].view(batch, n + 1)[:, 1:], D[:-1].view(batch, n + 1)[:, 1:] = h, weight
+    N = D * value
+    index = torch.arange(len(value) + 1, device=h.device)
+    start, due, rounds, before = index, gamma * value, 0, 0  # start: of each block, then the end; due: what the next has to reach
     while True:
-        leads = torch.ones_like(start, dtype=torch.bool)  # the blocks that stay, then the end of the line
-        torch.logical_not(value[1:] < due[:-1], out=leads[1:-1])
-        lead = leads.nonzero()[:, 0]
-        if len(lead) == len(start):
+        falls = value[1:] < due[:-1]
+        fallen = int(falls.count_nonzero())
+        if fallen == 0:
             break
-        rounds += 1
-        into = leads[:-1].cumsum(0) - 1
+        leads = torch.ones_like(start, dtype=torch.bool)  # the blocks that stay, then the end of the line
+        torch.logical_not(falls, out=leads[1:-1])
+        if 4 * fallen < len(value):  # otherwise falls alone fill half of the windows after `low`, which hold half a line in all
+            low = (leads[:-1] > leads[1:]).nonzero()[:, 0] + 1
+            width = len(value) // (2 * len(low))
+            if width >= WIDE and 2 * len(low) > before:  # while one neighbour a round halves the runs, it is the cheaper way
+                leads.index_fill_(0, _reach(low, width, start, value, N, D, scales), False)
+            before = len(low)
+        lead = leads.nonzero()[:, 0]
+        into = leads[:-1].cumsum(0).sub_(1)
         merged = start.index_select(0, lead)
-        scale = powers.index_select(1, start[:-1] - merged.index_select(0, into))
-        sums = sums.new_zeros(2, len(lead) - 1).index_add_(1, into, scale * sums)
-        start, value = merged, sums[0] / sums[1]
-        due = power.index_select(0, start[1:] - start[:-1]) * value
+        scale = power.index_select(0, start[:-1] - merged.index_select(0, into))
+        N = h.new_zeros(len(lead) - 1).index_add_(0, into, N * scale)
+        D = h.new_zeros(len(lead) - 1).index_add_(0, into, D * scale.square_())
+        start, value = merged, N / D
+        due = power.index_select(0, start[1:] - start[:-1]).mul_(value)
+        rounds += 1
     if rounds == 0:
         return h, 0
-    block = torch.repeat_interleave(start[1:] - start[:-1])
+    block = torch.repeat_interleave(start[1:] - start[:-1], output_size=len(index) - 1)
     v = value.index_select(0, block) * power.index_select(0, index[:-1] - start.index_select(0, block))
-    return v.view(batch, n + 1)[:, :n], rounds
+    return v[:-1].view(batch, n + 1)[:, 1:], rounds
+
+
+def _reach(low: Tensor, width: int, start: Tensor, value: Tensor, N: Tensor, D: Tensor, scales: Tensor) -> Tensor:
+    """The blocks to merge with the one before them round each run of falls, which begins at block `low`: up to `width` to a side.
+
+    Two neighbours of which the second falls lie in one block of the answer, whichever are merged first. So blocks low - 1 and low
+    take in, side by side, the one before as long as its value is >= u, and the one after as long as that is <= u, where u is the
+    value of all that lies between, carried to one index by powers of gamma: u and both comparisons come from cumulative sums, a
+    whole window at once. A sweep adds to one side what the other had taken before it. What a side has taken in lies in one block
+    with low, and stays there whatever the other side takes.
+
+    low [r] -> indices of blocks, some of them more than once
+    """
+    k, low = torch.arange(width, device=low.device), low[:, None]
+    at = (low + torch.stack((~k, k))[:, None]).clamp_(0, len(value) - 1)  # [2, r, width]: outwards, past an end its NaN
+    away = start.index_select(0, at.flatten()).view_as(at).sub_(start.take(low) - len(scales) // 2).clamp_(0, len(scales) - 1)
+    scale = scales.index_select(0, away.flatten()).view_as(at)
+    bound = value.index_select(0, at.flatten()).view_as(at).div_(scale)[..., 1:]
+    sums = N.index_select(0, at.flatten()).view_as(at).mul_(scale).cumsum(-1)
+    weights = D.index_select(0, at.flatten()).view_as(at).mul_(scale.square_()).cumsum(-1)
+    bound[1].neg_()  # after low all signs are changed, so that it is <= on both sides
+    sums[1].neg_()
+    far = torch.zeros_like(at[..., :1])
+    for _ in range(SWEEPS):
+        u = (sums[..., :-1] - sums.gather(2, far).flip(0)).div_(weights[..., :-1] + weights.gather(2, far).flip(0))
+        joins = (u <= bound).logical_or_(k[:-1] < far)
+        far = torch.add(k[:-1], joins, alpha=width - 1).amin(2, keepdim=True)  # how many do before the first that does not
+    taken = torch.minimum(k, far)
+    taken[0].neg_()
+    return taken.add_(low).flatten()
 
 
 def _powers(gamma: float, n: int, like: Tensor) -> Tensor:
     """gamma^0, ..., gamma^n."""
-    return gamma ** torch.arange(n + 1, device=like.device).to(like.dtype)
+    return _scales(gamma, n, like.dtype, like.device)[n:]
+
+
+@lru_cache(maxsize=16)
+def _scales(gamma: float, n: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """gamma^-n, ..., gamma^n, NaN where the square would overflow."""
+    scales = gamma ** torch.arange(-n, n + 1, device=device).to(dtype)
+    return scales.masked_fill_(scales > torch.finfo(dtype).max ** 0.4, torch.nan)
 
 
 # high-order chains ----------------------------------------------------------------------------------------------------

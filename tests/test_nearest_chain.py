@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.chains import nearest_chain
+from cdiff_cli.chains import nearest_chain, pool_violators
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.projection import project
@@ -62,7 +62,7 @@ def test_long_nearest_chains_are_optimal_and_idempotent(n, alpha, start):
     """Stationarity  w_k (v_k - h_k) + gamma lam_k - lam_{k-1} = 0,  lam >= 0 only where v_{k+1} = gamma v_k."""
     gamma, w, fixed = 1 - alpha, normal(n, n).abs() + 0.2, _fixed(n, *([] if start == "free" else [0]))
     rise, fall = torch.linspace(0, 9, n, dtype=F64), torch.linspace(1, 0, n, dtype=F64)
-    rise[-1] = -40.0  # takes in one neighbour a round
+    rise[-1] = -40.0  # takes in many neighbours
     h = torch.stack((normal(1, n), normal(2, n).cumsum(0), 1 + (12 * fall).sin(), fall, rise))
     v = nearest_chain(h, gamma, w, fixed)
     gap, push = v[:, 1:] - gamma * v[:, :-1], w * (v - h)
@@ -76,6 +76,71 @@ def test_long_nearest_chains_are_optimal_and_idempotent(n, alpha, start):
     assert float((lam * gap).abs().max()) <= rounding * (1 + float(lam.max()) + float(gap.max()))
     assert start != "free" or float(unbalanced.abs().max()) <= rounding
     torch.testing.assert_close(nearest_chain(v, gamma, w, fixed), v, atol=rounding, rtol=0)
+
+
+def _pooled_one_by_one(h, gamma, w):
+    """The stack of pooled adjacent violators, one index after the other: (N, D, length) of each block."""
+    blocks = []
+    for value, weight in zip(h.tolist(), w.tolist(), strict=True):
+        blocks.append((weight * value, weight, 1))
+        while len(blocks) > 1 and blocks[-1][0] / blocks[-1][1] < gamma ** blocks[-2][2] * blocks[-2][0] / blocks[-2][1]:
+            (N, D, n), (N2, D2, n2) = blocks[-2:]
+            blocks[-2:] = [(N + gamma**n * N2, D + gamma ** (2 * n) * D2, n + n2)]
+    return vec(*(N / D * gamma**k for N, D, n in blocks for k in range(n)))
+
+
+def _wave(seed, n):
+    s = torch.linspace(0, 1, n, dtype=F64)
+    return 1 + (20 * torch.rand(1, generator=torch.Generator().manual_seed(seed), dtype=F64) * s + seed).sin()
+
+
+KINDS = {
+    "noise": normal,
+    "walk": lambda seed, n: normal(seed, n).cumsum(0),
+    "wave": _wave,
+    "wave and noise": lambda seed, n: _wave(seed, n) + normal(seed, n, scale=1e-3),
+    "ties": lambda seed, n: normal(seed, n).round(),
+    "drop in a rise": lambda seed, n: torch.linspace(0, 9, n, dtype=F64).index_fill(0, torch.tensor(seed % n), -1e3),
+    "peak in a rise": lambda seed, n: torch.linspace(0, 9, n, dtype=F64).index_fill(0, torch.tensor(seed % n), 1e3),
+    "steps": lambda seed, n: (torch.linspace(0, 8, n, dtype=F64).floor() - 4) * normal(seed, 1),
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kinds=st.lists(st.sampled_from(sorted(KINDS)), min_size=1, max_size=6),
+    seed=st.integers(0, 10_000),
+    n=st.integers(2, 200),
+    alpha=st.sampled_from([1e-3, 0.05, 0.5, 0.85, 1.0]),
+    spread=st.sampled_from([0.0, 1.0, 3.0]),
+)
+def test_rounds_of_wide_merges_end_where_merging_one_by_one_does(kinds, seed, n, alpha, spread):
+    h = torch.stack([KINDS[kind](seed + at, n) for at, kind in enumerate(kinds)])
+    w = (spread * normal(seed, len(kinds), n)).exp()
+    v, _ = pool_violators(h, 1 - alpha, w)
+    expected = torch.stack([_pooled_one_by_one(*one) for one in zip(h, [1 - alpha] * len(h), w, strict=True)])
+    torch.testing.assert_close(v, expected, atol=1e-15 * n * float(h.abs().max()), rtol=0)  # rounding of a sum of n terms
+
+
+def test_a_block_that_outweighs_all_between_takes_in_none_of_it():
+    """With the first 60 values in one block, what follows changes the value pooled with it by less than rounding: a test on that
+    value could not tell that the block stays out.
+    """
+    h = torch.linspace(0, 1, 120, dtype=F64).repeat(8, 1)
+    h[:, :60] = -torch.linspace(1, 3, 8, dtype=F64)[:, None]
+    h[:, 60:71] = vec(0.7, 1.25, 0.87, 0.22, -0.7, 0.1, -0.15, 1.5, 0.4, 0.02, -1.4)
+    v, _ = pool_violators(h, 0.15, torch.ones_like(h))
+    expected = torch.stack([_pooled_one_by_one(one, 0.15, torch.ones(120)) for one in h])
+    torch.testing.assert_close(v, expected, atol=1e-15, rtol=0)  # rounding
+    assert bool((v[:, 61] == 1.25).all())
+
+
+@pytest.mark.parametrize(("end", "value"), [(-1, -1e3), (0, 1e3)])
+@pytest.mark.parametrize(("alpha", "rounds"), [(0.05, 1), (1e-3, 20)])  # one neighbour a round would take 96 to 383
+def test_a_lone_value_takes_in_a_whole_rise_in_few_rounds(end, value, alpha, rounds):
+    h = torch.linspace(0, 1, 384, dtype=F64).repeat(10, 1)
+    h[:, end] = value
+    assert pool_violators(h, 1 - alpha, torch.ones_like(h[0]))[1] <= rounds
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
