@@ -97,7 +97,11 @@ def nearest_reachable(
         if rest or k == 0:
             w0 = track.solve(_toward(x, weight.double(), copy - push, where) if rest else x, torch.zeros_like(w))
         active[..., m:] *= b < NEVER  # a warm start may know rows that are not there now
-        w[some], active[some], soft[some] = settle(track, w0[some], rows, a[some], b[some], active[some], soft[some])
+        each = m + slots * bool(walled.any())  # rows a step: half-spaces only where some plan has them
+        near_a, near_b = a[some, :, : each - m], b[some, :, : each - m]
+        w[some], active[some, :, :each], soft[some] = settle(
+            track, w0[some], rows, near_a, near_b, active[some, :, :each], soft[some]
+        )
         at = torch.cat((held.values[:, :1], w[..., where]), 1)
         unsafe = crossed(parts, at, rows.tolerance)
         if rest:
