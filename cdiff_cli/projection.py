@@ -35,7 +35,7 @@ from cdiff_cli.rates import Rate, Slowed, refuse_contradiction
 from cdiff_cli.reaching import Warm, nearest_reachable
 from cdiff_cli.segments import crossed, goes_round, nearest_around
 
-REFINEMENTS = 3  # choices of the tangent planes; within sampling one: the others change a finished plan's distance by 0.8 % at most
+REFINEMENTS = 3  # choices of the tangent planes; within sampling one: the others change a plan's distance by 2.5 % at most
 ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (reaching.py)
 DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
 FILTERED = 8  # parts at most that are left out in turn to find which are in conflict
