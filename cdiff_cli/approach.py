@@ -83,5 +83,5 @@ def approached(ball: Ellipsoid, later: Tensor, led: Tensor, time: float) -> Appr
     later   where its centre will be `time` seconds on    [..., k]
     led     the state `time` seconds on is led x          [dim, dim]
     """
-    rates = ball.which @ (led - torch.eye(len(led)).to(led)) / time
+    rates = ball.which @ (led - torch.eye(len(led), dtype=led.dtype, device=led.device)) / time
     return Approach(ball.which, ball.centre, rates, (later - ball.centre) / time, ball.m, time)

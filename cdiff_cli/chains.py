@@ -289,7 +289,7 @@ def _by_flipping(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
     sign change sides at once; where that has not helped three times in a row, the last of them alone, which ends for certain.
     """
     Q = (D * way[..., None, :]) @ D.T
-    one, rounding = torch.eye(len(D)).to(Q), 1e-12 * (1 + b.abs().amax(1, keepdim=True))
+    one, rounding = torch.eye(len(D), dtype=Q.dtype, device=Q.device), 1e-12 * (1 + b.abs().amax(1, keepdim=True))
     active = b < -rounding
     best, left = torch.full_like(b[:, :1], len(D) + 1), torch.full_like(b[:, :1], 3)
     lam = torch.zeros_like(b)

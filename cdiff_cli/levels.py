@@ -166,7 +166,7 @@ class Quadric:
         if bool((self.q[..., ~own] != 0).any()) or bool((size <= 0).any()):
             return None
         axes = (size[..., None] / weight).sqrt()
-        return Ellipsoid(torch.eye(len(own)).to(axes)[own], centre, axes, axes.amin(-1), 1)
+        return Ellipsoid(torch.eye(len(own), dtype=axes.dtype, device=axes.device)[own], centre, axes, axes.amin(-1), 1)
 
 
 @dataclass(frozen=True)

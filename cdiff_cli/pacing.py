@@ -88,7 +88,7 @@ def bounds_only(pins: Pins) -> bool:
 def nearest_slowed(parts: Sequence[Waypoints | Segments], paces: Sequence[Pace], z: Traj, pins: Pins, turns: int = 0) -> Traj:
     """The trajectory nearest to z within the limits and around obstacles, of no dynamics: x' = x + u, of any u, makes every one."""
     wide = pins.paint(z).double()
-    one, none = torch.eye(z.shape[2]).to(wide), wide.new_zeros(z.shape[2])
+    one, none = torch.eye(z.shape[2], dtype=wide.dtype, device=wide.device), wide.new_zeros(z.shape[2])
     x, _ = nearest_paced(
         LinearDynamics(one, one, none, none - torch.inf, none + torch.inf),
         [part.to(wide) for part in parts],
@@ -129,7 +129,7 @@ def _always(dynamics: LinearDynamics, paces: Sequence[Pace], used: list[int], ho
     Rates in shares of their larger limit.
     """
     n, m = dynamics.B.shape
-    one, half = torch.eye(n + m).to(dynamics.A), (dynamics.high - dynamics.low) / 2
+    one, half = torch.eye(n + m, dtype=dynamics.A.dtype, device=dynamics.A.device), (dynamics.high - dynamics.low) / 2
     after = torch.cat((dynamics.A, dynamics.B), 1)[used]
     rows = [(-one[n:] / half[:, None], dynamics.high / half), (one[n:] / half[:, None], -dynamics.low / half)]
     lengths = []

@@ -106,7 +106,7 @@ def _rest(parts: Sequence[Part]) -> Callable[[Traj, Pins], Traj] | None:
 
 def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
     """The coordinates that the parts constrain."""
-    found = torch.zeros(dim, dtype=torch.bool)
+    found = torch.zeros(dim, dtype=torch.bool, device="cpu")
     for part in parts:
         level = part.acting if isinstance(part, Chain) else getattr(part, "level", None)
         if isinstance(level, Affine):
@@ -270,7 +270,9 @@ def _linearised(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: floa
     matrix = np.asarray if free.sum() <= 512 else sparse.csc_matrix  # ProxQP's sparse backend is 1e-5 off on small problems
     for _ in range(rounds):
         rows, pull, _ = g.linearise(x)
-        jacobian = np.stack([pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1]).to(x)])[:, free]
+        jacobian = np.stack(
+            [pull(w[None]).flatten().cpu().numpy() for w in torch.eye(rows.shape[1], dtype=x.dtype, device=x.device)]
+        )[:, free]
         slack = -rows[0].cpu().numpy() + jacobian @ x.flatten().cpu().numpy()[free]
         useful = np.abs(jacobian).max(1) > 1e-12
         with warnings.catch_warnings():

@@ -134,7 +134,7 @@ def by_active_set(rows: Rows, u0: Tensor, r: float = 0.0) -> Tensor:
     if not bool(touched.any()):
         return u0
     A, d = rows.A[touched], over[touched].clamp_min(-1e9)  # rows that ask nothing have c = inf
-    lam = nonnegative_least(A @ A.mT + r**2 * torch.eye(A.shape[-2]).to(A), d)
+    lam = nonnegative_least(A @ A.mT + r**2 * torch.eye(A.shape[-2], dtype=A.dtype, device=A.device), d)
     out = u0.clone()
     out[touched] = u0[touched] - (lam[:, None] @ A)[:, 0]
     _check(A, rows.c[touched], out[touched], r**2 * lam)
@@ -149,7 +149,7 @@ def nonnegative_least(M: Tensor, d: Tensor, rounds: int = 200) -> Tensor:
     """
     n = d.shape[-1]
     size = M.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp_min(1e-12)
-    eye = torch.eye(n).to(M)
+    eye = torch.eye(n, dtype=M.dtype, device=M.device)
     M = M + 1e-11 * size * eye
     tolerance = 1e-10 * (d.abs().where(d > -1e8, 0.0).amax(-1, keepdim=True) + 1e-6)
     active, lam = d > 0, torch.zeros_like(d)

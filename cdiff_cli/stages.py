@@ -33,7 +33,7 @@ class Factors(NamedTuple):
 
 def blocks(A: Tensor, B: Tensor) -> Blocks:
     n, m = B.shape
-    unit = torch.eye(n + BLOCK * m).to(A)
+    unit = torch.eye(n + BLOCK * m, dtype=A.dtype, device=A.device)
     state, each = unit[:n], []
     for k in range(BLOCK):
         own = unit[n + k * m : n + (k + 1) * m]
@@ -47,7 +47,7 @@ def factor(blocks: Blocks, H: Tensor) -> Factors:
     n, (batch, horizon, width, _) = len(blocks.onward), H.shape
     more = -horizon % BLOCK
     if more:
-        idle = torch.eye(width).to(H)
+        idle = torch.eye(width, dtype=H.dtype, device=H.device)
         idle[:n, :n] = 0.0
         H = torch.cat((H, idle.expand(batch, more, -1, -1)), 1)
     inside = H.view(batch, -1, BLOCK, width, width) @ blocks.within
