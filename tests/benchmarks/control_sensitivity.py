@@ -114,7 +114,7 @@ def main() -> None:
     titles = ("change", "margins", "return", "violation rate / %", "sum / rad/s", "worst / rad/s", "largest fall of h", "fell")
     for title in titles:
         table.add_column(title, justify="left" if title == "change" else "right")
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, width_ratios=(3, 2))
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.7), sharey=True, width_ratios=(3, 2), layout="constrained")
     colours = iter(["0.6", *plt.get_cmap("viridis")(np.linspace(0, 0.9, len(ALPHAS)))])
     for name, options in rows:
         if not name.startswith(asked.only):
@@ -137,10 +137,9 @@ def main() -> None:
         for axis in axes:
             axis.axhline(0, color="#d1495b", lw=1.2)
             axis.set(xlabel="time / s")
-        axes[0].set(ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit", ylim=(-1.2, 4.6))
+        axes[0].set(ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit")
         axes[1].set(title="approaches: median, 80 %; dotted: bound")
-        axes[0].legend(fontsize=8, frameon=False, ncols=3, loc="upper center")
-        figure.tight_layout()
+        figure.legend(fontsize=8, frameon=False, ncols=6, loc="outside upper center")
         figure.savefig(asked.picture, dpi=110)
 
 
