@@ -52,16 +52,17 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
 
 def crossed(parts: Sequence[Waypoints | Segments], x: Traj, tolerance: float = 0.0) -> Tensor:
     """Which trajectories violate one of the parts, those that planes() takes, by more than the tolerance [batch]."""
-    found = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    found = []
     for part in parts:
         level = part.level
         if isinstance(level, Affine):
-            found |= (level(x) > tolerance).any(1)
+            found.append((level(x) > tolerance).any(1))
         else:
             assert isinstance(level, Ellipsoid)
             y = ahead(level.scaled(x))
-            found |= (nearest_points(y[:, :-1], y[:, 1:])[1] < 1 - tolerance / level.m).any(1)
-    return found
+            least = 1 - tolerance / level.m if tolerance else 1.0
+            found.append((nearest_points(y[:, :-1], y[:, 1:])[1] < least).any(1))
+    return torch.stack(found).any(0) if len(found) > 1 else found[0] if found else x.new_zeros(len(x), dtype=torch.bool)
 
 
 def goes_round(part: Part) -> TypeGuard[Segments]:
