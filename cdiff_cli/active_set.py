@@ -101,7 +101,7 @@ def settle(
         if bool(proved.any()):
             proved &= (held == pushes).flatten(1).all(1)
             fresh = {"tries": SOFTLY, "left": PATIENCE, "fewest": most}
-            anew = {name: torch.where(proved, value, getattr(at, name)) for name, value in fresh.items()}
+            anew = {name: torch.where(proved, number, getattr(at, name)) for name, number in fresh.items()}
             at = at._replace(soft=at.soft | proved, **anew)
         going = proved | (wrong > 0) & (at.tries > 0)
         if not bool(going.all()):
