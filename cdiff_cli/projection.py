@@ -81,7 +81,7 @@ def project_reachable(g: Constraint, z: Traj, pins: Pins, warm: Warm | None = No
             tolerance=tolerance,
             begin=begin,
         )
-        none = u.new_zeros(len(u), 0)
+        none = u.new_zeros(len(u), 0)  # an interior point begins anew but for the inputs
         return pins.paint(part.encode(x).to(kind)), Warm(none, u, none, none, none)
     x, warm = nearest_reachable(
         part.dynamics,
