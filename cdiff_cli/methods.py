@@ -26,7 +26,7 @@ from cdiff_cli.diffusion import Method, Step
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection import project
 from cdiff_cli.safediffuser import SafeDiffuser
-from cdiff_cli.segments import Turned, apart, crossed, turned
+from cdiff_cli.segments import Turned, apart, crossed, row_blocks, turned
 
 On = Literal["noisy", "clean"]
 DualOn = Literal["noisy", "estimate", "clean"]
@@ -245,9 +245,8 @@ def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows
 
 def zeros(x: Traj, g: Constraint, expectation: Expectation, planes: bool) -> Rows:
     """Multipliers of the rows of g, or where segments go round balls of those of their tangent planes."""
-    round_, rest = apart(g) if planes else ([], g)
-    n = len(rest.labels(x.shape[1])) + 2 * len(round_) * x.shape[1]  # counted, not evaluated; a waypoint ends two segments
-    return x.new_zeros(1 if expectation == "batch_mean" else len(x), n)
+    blocks = row_blocks(g, x.shape[1], planes)  # counted, not evaluated
+    return x.new_zeros(1 if expectation == "batch_mean" else len(x), blocks[-1].stop if blocks else 0)
 
 
 def expect(rows: Rows, expectation: Expectation) -> Rows:

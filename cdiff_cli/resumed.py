@@ -11,7 +11,8 @@ from torch import Tensor
 from cdiff_cli.constraint import Constraint, Rows, Traj
 from cdiff_cli.data import Normaliser
 from cdiff_cli.diffusion import Method, Step
-from cdiff_cli.methods import AlmState
+from cdiff_cli.methods import AlmState, AugmentedLagrangian, PrimalDual
+from cdiff_cli.segments import row_blocks
 
 
 def moved_on(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
@@ -53,12 +54,11 @@ class Resumed:
         return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
 
     def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on part by part, the new ones at the end as they begin."""
+        """The last rows moved on block by block, the new ones at the end as they begin."""
         if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
             return fresh
-        out, at = fresh.clone(), 0
-        for part in g.parts:
-            count = len(part.labels(horizon))
-            out[:, at : at + count - self.shift] = last[:, at + self.shift : at + count]
-            at += count
+        out, planes = fresh.clone(), isinstance(self.method, PrimalDual | AugmentedLagrangian) and self.method.on != "noisy"
+        for block in row_blocks(g, horizon, planes):
+            kept = max(block.stop - block.start - self.shift, 0)
+            out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
         return out

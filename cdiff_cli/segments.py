@@ -9,6 +9,7 @@ the normals turning evenly from where it enters to where it leaves: a push strai
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from typing import TypeGuard
 
 import torch
@@ -109,6 +110,19 @@ def apart(g: Constraint) -> tuple[list[Segments], Constraint]:
     """The parts of g that go round a ball, and the others."""
     round_ = [part for part in g.parts if goes_round(part)]
     return round_, Constraint(tuple(part for part in g.parts if not goes_round(part))) if round_ else g
+
+
+def row_blocks(g: Constraint, horizon: int, planes: bool) -> list[slice]:
+    """Where the multipliers of g stand, block by block; a block's rows follow the waypoints, so that a plan moved on by some
+    waypoints moves each block by as many rows.
+
+    planes   of the rows of turned(g): those of the other parts, then of each ball the segments before each waypoint and those
+             after it; False: of the rows of g itself
+    """
+    round_, rest = apart(g) if planes else ([], g)
+    counts = [len(part.labels(horizon)) for part in rest.parts] + 2 * len(round_) * [horizon]
+    ends = list(accumulate(counts, initial=0))
+    return [slice(begin, end) for begin, end in pairwise(ends)]
 
 
 def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint | Turned:
