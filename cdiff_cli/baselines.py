@@ -46,20 +46,6 @@ class Conditional:
 
 
 @dataclass(frozen=True)
-class Terminal:
-    """Only the trajectory that sampling ends at is asked to obey, as DiRecT does (Giaretta et al., 2026): the clean estimate is
-    projected and the sample follows by the whole displacement, x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0).
-    """
-
-    def init(self, x: Traj, g: Constraint) -> None:
-        return None
-
-    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
-        x0 = project(g, step.x0, step.pins, strict=False)
-        return step.reverse(step.x0) + step.level * (x0 - step.x0), None
-
-
-@dataclass(frozen=True)
 class FinalProjection:
     """The unconstrained plan, projected once when it is done."""
 

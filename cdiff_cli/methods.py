@@ -13,14 +13,15 @@ path (segments.py), which keep their places from step to step: g's own push each
 What the paper compares with stands in safediffuser.py and baselines.py; METHODS names them all.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Literal, NamedTuple, get_args, get_type_hints
+from functools import partial
+from typing import Any, Literal, NamedTuple, cast, get_args, get_type_hints
 
 import torch
 from torch.nn import functional as F
 
-from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance, Terminal
+from cdiff_cli.baselines import BestOf, Conditional, FinalProjection, Guidance
 from cdiff_cli.constraint import Constraint, Pull, Rows, Traj
 from cdiff_cli.diffusion import Method, Step
 from cdiff_cli.errors import CdiffError, suggestion
@@ -171,34 +172,53 @@ class AugmentedLagrangian:
         return min(self.c * rho, max(self.rho, 1.0)) if self.on == "clean" else self.c * rho
 
 
-METHODS: dict[str, type[Method]] = {
+METHODS: dict[str, Callable[..., Method]] = {
     "diffuser": Unconstrained,
     "guidance": Guidance,
     "conditional": Conditional,
     "best-of-k": BestOf,
     "final-projection": FinalProjection,
-    "terminal": Terminal,
+    "terminal": partial(Projected, on="clean", correction="latent"),
     "safediffuser": SafeDiffuser,
     "projected": Projected,
     "primal-dual": PrimalDual,
     "alm": AugmentedLagrangian,
 }
+"""A partial holds what its method fixes. `terminal`: only the trajectory that sampling ends at is asked to obey, as DiRecT does
+(Giaretta et al., 2026).
+"""
 
 
 def make_method(name: str, settings: Mapping[str, Any]) -> Method:
     """The method of that name with those hyper-parameters; CdiffError where either does not exist or is out of range."""
     if name not in METHODS:
         raise CdiffError(f'no method "{name}"{suggestion(name, METHODS)}; choose from {", ".join(METHODS)}')
-    kind = METHODS[name]
-    hints = get_type_hints(kind)
-    known = [f.name for f in fields(kind)]  # type: ignore[arg-type]
+    hints, known = get_type_hints(_kind(name)), _open(name)
     values = {}
     for key, value in settings.items():
         if key not in known:
             has = ", ".join(known) or "none"
             raise CdiffError(f'{name} has no setting "{key}"{suggestion(key, known)}; its settings are: {has}')
         values[key] = _typed(f"{name}.{key}", value, hints[key])
-    return kind(**values)
+    return METHODS[name](**values)
+
+
+def settings_of(name: str, method: Method) -> dict[str, Any]:
+    """The values of the settings that the method of that name leaves open."""
+    return {key: getattr(method, key) for key in _open(name)}
+
+
+def _kind(name: str) -> type[Method]:
+    """The class behind the name."""
+    made = METHODS[name]
+    return cast(type[Method], made.func if isinstance(made, partial) else made)
+
+
+def _open(name: str) -> list[str]:
+    """The settings that can be asked for: those of the class that the name does not fix."""
+    made = METHODS[name]
+    fixed = made.keywords if isinstance(made, partial) else {}
+    return [f.name for f in fields(_kind(name)) if f.name not in fixed]  # type: ignore[arg-type]
 
 
 def slack(g: Rows, lam: Rows, rho: float) -> Rows:

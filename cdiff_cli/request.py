@@ -21,7 +21,7 @@ from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule
 from cdiff_cli.dynamics import Reachable, dynamics_of
 from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.margins import tightened
-from cdiff_cli.methods import METHODS, Unconstrained, make_method
+from cdiff_cli.methods import METHODS, Unconstrained, make_method, settings_of
 from cdiff_cli.planning import Problem, check_feasible
 from cdiff_cli.rates import Rate
 from cdiff_cli.recipe import Preset, Recipe, home, load_recipe, shown
@@ -196,7 +196,7 @@ def resolve(options: Options) -> Resolved:
     preset = recipe.presets[options.preset]
     settings = {**preset.methods.get(options.method, {}), **parse_settings(options.settings)}
     method = make_method(options.method, settings)
-    settings = asdict(method)  # type: ignore[call-overload]
+    settings = settings_of(options.method, method)
     kernel = options.kernel or preset.kernel
     if kernel not in KERNELS:
         raise CdiffError(f'no kernel "{kernel}"{suggestion(kernel, KERNELS)}; choose from {", ".join(KERNELS)}')

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.baselines import BestOf, FinalProjection, Guidance, Terminal
+from cdiff_cli.baselines import BestOf, FinalProjection, Guidance
 from cdiff_cli.constraint import Pins
 from cdiff_cli.diffusion import Schedule, Step, sample
+from cdiff_cli.errors import CdiffError
 from cdiff_cli.levels import Affine
-from cdiff_cli.methods import METHODS, Projected, Unconstrained
+from cdiff_cli.methods import METHODS, Projected, Unconstrained, make_method
 from cdiff_cli.planning import candidate_seed, plan
 from cdiff_cli.request import Options, resolve
 from cdiff_cli.runs import METHOD_ORDER
@@ -42,8 +43,23 @@ def test_guidance_leaves_pins_alone():
 
 
 def test_terminal_is_the_projection_with_latent_correction():
-    g = waypoints(Affine(vec(1.0, 1.0), num(0.8)))
-    assert torch.equal(plans(Terminal(), g), plans(Projected(correction="latent"), g))
+    """By hand: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0)."""
+    terminal, g = make_method("terminal", {}), waypoints(Affine(vec(1.0, 1.0), num(0.8)))
+    assert terminal == Projected(on="clean", correction="latent")
+    assert torch.equal(plans(terminal, g), plans(Projected(correction="latent"), g))
+    x = normal(0, 3, 4, 2)
+    out, _ = terminal.step(step_of(x), g, None)
+    torch.testing.assert_close(out, x / 2 + 0.8 * (free_projection(g, x) - x), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("setting", ["on=clean", "correction=latent", "eta=1"])
+def test_terminal_has_no_settings_and_records_none(setting):
+    with pytest.raises(CdiffError, match=f'terminal has no setting "{setting.split("=")[0]}"; its settings are: none'):
+        resolve(Options(task="gaussian2d", method="terminal", settings=(setting,)))
+    resolved = resolve(Options(task="gaussian2d", method="terminal"))
+    assert resolved.method == Projected(on="clean", correction="latent")
+    assert resolved.config()["method"] == {"terminal": {}}
+    assert resolved.row()["method"] == "terminal"
 
 
 def test_the_final_projection_is_the_unconstrained_plan_projected():
