@@ -17,9 +17,6 @@ from cdiff_cli.constraint import Constraint, Part, Pull, Rows, Traj
 from cdiff_cli.levels import each_end, take
 
 Array = NDArray[np.float64]
-"""Of 0, 0.9, 0.95 and 0.995 the one with the smallest distance, all as safe when executed: alm on maze2d-umaze-disc and -slalom,
-100 random pairs, seed 2000.
-"""
 
 
 @dataclass(frozen=True)
