@@ -236,7 +236,7 @@ def _extra(name: str) -> Iterator[None]:
     try:
         yield
     except ImportError:
-        raise CdiffError(f"--backend {name}: not installed here; install the extra: pip install 'cdiff[{name}]'") from None
+        raise CdiffError(f"--backend {name}: not installed here; install the extra: pip install 'cdiff-cli[{name}]'") from None
 
 
 # progress -------------------------------------------------------------------------------------------------------------

@@ -177,7 +177,7 @@ def test_a_bad_option_is_one_clear_line_and_writes_nothing(words, message, tmp_p
 def test_a_backend_that_is_not_installed_names_its_extra(backend, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, backend, None)
     words = ("--task", "gaussian2d", "--methods", "diffuser", "--seeds", "1", "--backend", backend)
-    assert f"cdiff[{backend}]" in cdiff("sweep", *words, "--runs", tmp_path, code=2).stderr
+    assert f"pip install 'cdiff-cli[{backend}]'" in cdiff("sweep", *words, "--runs", tmp_path, code=2).stderr
 
 
 def cluster(monkeypatch, cpus=None):

@@ -3,7 +3,7 @@
     python tests/benchmarks/sweeps.py [--ray] [--task maze2d-umaze] [--seeds 10] [--folder FOLDER]
 
 Five methods, recommended, `--jobs 2`: once uninterrupted; once with its whole process group killed by SIGKILL when half of its runs
-are there, and started again; with --ray (`pip install 'cdiff[ray]'`) once more on a Ray cluster of two nodes of one CPU, each a
+are there, and started again; with --ray (`pip install 'cdiff-cli[ray]'`) once more on a Ray cluster of two nodes of one CPU, each a
 process of this machine. Compared are the rows and arrays of every run, and the table that `cdiff compare` makes of them, all but
 times. Exit code 1 where anything differs. About a minute and a half a sweep on two cores.
 """
