@@ -23,8 +23,7 @@ from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
 MARGIN = 1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
-CLEARANCE = 5e-3  # the same where dynamics are obeyed: the execution stays near the plan, not on it
-TOUCHING = 1e-5  # what remains of it where it leaves no plan
+TOUCHING = 1e-5  # what remains of the task's clearance where that leaves no plan
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,8 @@ def check_feasible(problem: Problem) -> None:
 
 def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) -> None:
     point = ", ".join(f"{c} = {v:g}" for c, v in zip(problem.task.positions, state[columns], strict=True))
-    is_free = getattr(problem.task, "is_free", None)
-    if is_free is not None and not is_free(state[columns], 0.1):
+    task: Any = problem.task
+    if hasattr(task, "is_free") and not task.is_free(state[columns], task.footprint):
         raise CdiffError(f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}")
     for part in problem.g.parts:
         level = getattr(part, "level", None)
@@ -123,7 +122,7 @@ def plan(
     scale, centre = problem.normaliser.scale, problem.normaliser.centre
     like = torch.empty(0, device=device)
     others, dynamics = split(problem.enforced)
-    inside = others.tighten(CLEARANCE) if dynamics.parts else others
+    inside = others.tighten(problem.task.tolerances.clearance) if dynamics.parts else others
     g, scored = (pull_back(constraint, centre, scale).to(like) for constraint in (inside, problem.g))
     pins = make_pins(problem, len(seeds))
     shape = (problem.horizon, dim)
@@ -224,24 +223,25 @@ def polish_plans(problem: Problem, z: Traj) -> tuple[Traj, Array, Array | None]:
 
 def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array]:
     """Plans near z that the dynamics make, and their inputs: solved as finely as it takes for the rollout of the inputs to be safe
-    and to end within a millimetre of the pinned state. Where no plan keeps CLEARANCE, as from a start that does not, one that keeps
-    TOUCHING is taken if that is safe and ends there.
+    and to end where it is pinned, to the task's tolerance. Where no plan keeps the task's clearance, as from a start that does not,
+    one that keeps TOUCHING is taken if that is safe and ends there.
     """
     (reachable,) = dynamics_of(problem.enforced)
+    near_enough, most = problem.task.tolerances.position, problem.task.tolerances.clearance
     scale, dynamics, others = problem.normaliser, reachable.dynamics, split(problem.enforced)[0]
     todo, warm = torch.arange(len(z)), None
     x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
-    for clearance, tolerance in ((CLEARANCE, 5e-4), (CLEARANCE, 5e-5), (CLEARANCE, 5e-6), (TOUCHING, 5e-6)):
+    for clearance, tolerance in ((most, 5e-4), (most, 5e-5), (most, 5e-6), (TOUCHING, 5e-6)):
         inside = Constraint((reachable, *others.tighten(clearance).parts))
         g = pull_back(inside, scale.centre, scale.scale).take(todo)
         pinned = pins.values[todo]
-        warm = warm if clearance == CLEARANCE else None
+        warm = warm if clearance == most else None
         near, warm = project_reachable(g, z[todo], Pins(pins.mask, pinned), warm, tolerance)
         made = torch.clamp(warm.u, dynamics.low, dynamics.high)
         path = scale.encode(dynamics.rollout(scale.decode(near[:, 0]), made))
-        missed = (scale.scale * torch.where(pins.mask, path - pinned, 0.0)).abs().amax((1, 2)) > 1e-3
+        missed = (scale.scale * torch.where(pins.mask, path - pinned, 0.0)).abs().amax((1, 2)) > near_enough
         wrong = missed | (others(scale.decode(path)) > 0).any(1)
-        kept = ~wrong | (clearance == CLEARANCE)
+        kept = ~wrong | (clearance == most)
         x[todo[kept]], u[todo[kept]] = path[kept], made[kept]
         if not bool(wrong.any()):
             break

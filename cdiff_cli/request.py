@@ -31,7 +31,6 @@ from cdiff_cli.training import choose_device
 from cdiff_cli.trips import parse_state, random_pairs
 
 Array = NDArray[np.float64]
-VELOCITY_WEIGHT = 0.02  # s^2, beside 1 for positions in the distance to the dynamics: a plan's places matter more than its rates
 
 
 @dataclass(frozen=True)
@@ -323,7 +322,8 @@ def _obeyed(kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, ch
     dynamics = checkpoint.dynamics if checkpoint else None
     if preset.dynamics and dynamics is not None and not dynamics_of(g):
         parts = (*parts, Reachable.of("dynamics", dynamics, DYNAMICS_TOLERANCE))
-    weight = torch.tensor([VELOCITY_WEIGHT if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
+    slow = task.tolerances.velocity_weight
+    weight = torch.tensor([slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64)
     parts = tuple(replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts)
     unchanged = len(parts) == len(g.parts) and all(part is declared for part, declared in zip(parts, g.parts, strict=True))
     return g if unchanged else Constraint(parts)

@@ -13,7 +13,6 @@ from cdiff_cli.constraint import Chain, Constraint, Pins, Segments, Waypoints
 from cdiff_cli.dynamics import LinearDynamics, Reachable, dynamics_of, fit, split
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
-from cdiff_cli.planning import CLEARANCE
 from cdiff_cli.projection import project, project_reachable
 from cdiff_cli.rates import Rate, limits
 from cdiff_cli.reaching import nearest_reachable
@@ -355,8 +354,8 @@ def test_chains_and_quadrics_beside_dynamics_are_obeyed(other):
     g = Constraint((reachable(maze(), weight=WEIGHT), other))
     assert float(other(z).max()) > 1e-3
     x, warm = project_reachable(g, z, pin(z, 0), None, 1e-3)
-    assert float(other(x).max()) <= CLEARANCE  # which a polish leaves
-    assert float(warm.u.abs().max()) <= 1 + CLEARANCE
+    assert float(other(x).max()) <= 5e-3  # which a polish leaves
+    assert float(warm.u.abs().max()) <= 1 + 5e-3
     torch.testing.assert_close(x[:, 0], z[:, 0], atol=1e-12, rtol=0)
 
 

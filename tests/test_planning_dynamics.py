@@ -1,6 +1,6 @@
 """Plans under the checkpoint's linear dynamics: what the polish leaves, what is saved, what an execution makes of it."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,14 +10,17 @@ import yaml
 from cdiff_cli.checkpoint import load_checkpoint, read_safetensors, save_checkpoint
 from cdiff_cli.constraint import Constraint, Waypoints
 from cdiff_cli.dynamics import dynamics_of
-from cdiff_cli.errors import SpecError
+from cdiff_cli.errors import CdiffError, SpecError
 from cdiff_cli.experiment import plan_run
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import Projected, make_method
 from cdiff_cli.metrics import hits_wall
-from cdiff_cli.planning import CLEARANCE, follow, plan, polish_plans
+from cdiff_cli.planning import check_feasible, follow, plan, polish_plans
+from cdiff_cli.projection import project_reachable
 from cdiff_cli.recipe import home
 from cdiff_cli.request import Options, resolve
+from cdiff_cli.tasks import Tolerances
+from cdiff_cli.tasks.maze2d import UMAZE, Maze2D
 from cdiff_cli.verify import verify_run
 
 DISC = {"name": "disc", "kind": "quadratic", "side": "outside", "centre": {"x": 1.0, "y": -0.2}, "radius": 0.2}
@@ -66,7 +69,7 @@ def test_a_polished_plan_is_what_its_inputs_produce_within_their_bounds(resolved
 def test_a_polished_plan_is_safe_on_its_segments_and_reaches_the_goal(resolved, plans):
     assert float(resolved.problem.enforced(torch.from_numpy(plans.x)).max()) <= 0.0
     np.testing.assert_allclose(plans.x[:, 0], np.tile(resolved.problem.start, (2, 1)), atol=1e-12)
-    np.testing.assert_allclose(plans.x[:, -1], np.tile(resolved.problem.goal, (2, 1)), atol=CLEARANCE)
+    np.testing.assert_allclose(plans.x[:, -1], np.tile(resolved.problem.goal, (2, 1)), atol=UMAZE.tolerances.clearance)
 
 
 def test_without_dynamics_there_are_no_inputs(resolved):
@@ -146,3 +149,62 @@ def test_the_trace_counts_the_constraints_as_they_are_scored_and_not_the_dynamic
     plans = plan(problem, resolved.method, [0], kernel=resolved.kernel)
     noisy = [float(scored(torch.from_numpy(x)).clamp_min(0).sum()) for x in plans.chain[:-1]]
     np.testing.assert_allclose(plans.trace[:, 0, 0], noisy, rtol=1e-4, atol=1e-4)  # the trace is kept in float32
+
+
+class Careful(Maze2D):
+    """The maze with tolerances of its own."""
+
+    tolerances = Tolerances(position=100.0, clearance=0.05, velocity_weight=0.5)
+    footprint = 0.25
+
+
+@pytest.fixture
+def careful(resolved, checkpoint, constraints, monkeypatch):
+    """The same problem of that task."""
+    task = Careful(**{f.name: getattr(UMAZE, f.name) for f in fields(UMAZE)})
+    monkeypatch.setattr("cdiff_cli.request.load_task", lambda _: task)
+    return resolve(Options(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints))
+
+
+def test_a_task_weighs_velocities_its_own_way(resolved, careful):
+    assert UMAZE.tolerances == Tolerances(position=1e-3, clearance=5e-3, velocity_weight=0.02)
+    assert dynamics_of(resolved.problem.enforced)[0].weight.tolist() == [1.0, 1.0, 0.02, 0.02]
+    assert dynamics_of(careful.problem.enforced)[0].weight.tolist() == [1.0, 1.0, 0.5, 0.5]
+
+
+def test_a_task_keeps_its_own_clearance(resolved, careful, plans):
+    """A ceiling that the plans cross by 2 cm and less."""
+    z = torch.from_numpy(plans.x)
+    ceiling = z[..., 1].max() - 0.02
+    near = Waypoints("near", Affine(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling))
+    assert float(near(z).max()) > 0.0
+    for kept, clearance in ((resolved, 5e-3), (careful, 0.05)):
+        enforced = Constraint((near, *dynamics_of(kept.problem.enforced)))
+        problem = replace(kept.problem, enforced=enforced, goal=None)
+        x = problem.normaliser.decode(polish_plans(problem, problem.normaliser.encode(z))[0])
+        assert float(near(x).max()) == pytest.approx(-clearance, abs=2e-3)
+
+
+def test_a_task_says_how_near_to_its_pins_a_plan_must_end(resolved, careful, monkeypatch):
+    """A goal out of reach: tried with ever finer tolerances, unless the task is content."""
+    tolerances = []
+
+    def counted(*words):
+        tolerances.append(words[-1])
+        return project_reachable(*words)
+
+    monkeypatch.setattr("cdiff_cli.planning.project_reachable", counted)
+    z = torch.zeros(1, 16, 4, dtype=torch.float64)
+    polish_plans(replace(careful.problem, horizon=16), z)
+    assert tolerances == [5e-4]
+    polish_plans(replace(resolved.problem, horizon=16), z)
+    assert tolerances[1:] == [5e-4, 5e-5, 5e-6, 5e-6]
+
+
+def test_a_start_is_free_where_the_task_has_room_for_its_footprint(resolved, careful):
+    """0.2 m from the outer wall on the left, x = -1.5."""
+    assert UMAZE.footprint == 0.1
+    start, g = np.array([-1.3, 1.0, 0.0, 0.0]), Constraint(())
+    check_feasible(replace(resolved.problem, start=start, g=g))
+    with pytest.raises(CdiffError, match="inside a wall or touches one"):
+        check_feasible(replace(careful.problem, start=start, g=g))

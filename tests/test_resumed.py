@@ -12,8 +12,8 @@ from tests.problems import F64, ball, half_space, normal
 
 H = 5
 G = Constraint((Segments("ball", ball(1)), Waypoints("wall", half_space())))  # 4 segments, 5 waypoints
-NOISY = {"expected": [101, 102, 103, 0] + [105, 106, 107, 108, 0], "n": 9}  # in the order of g
-PLANES = {"expected": [101, 102, 103, 104, 0] + [106, 107, 108, 109, 0] + [111, 112, 113, 114, 0], "n": 15}
+NOISY = {"expected": [101, 102, 103, 0, *(105, 106, 107, 108, 0)], "n": 9}  # in the order of g
+PLANES = {"expected": [101, 102, 103, 104, 0, *(106, 107, 108, 109, 0), *(111, 112, 113, 114, 0)], "n": 15}
 """The wall; then of the ball the segments before each waypoint, and those after it."""
 
 
@@ -38,8 +38,8 @@ def test_one_step_executed_moves_each_block_of_rows_by_one(kind, on, known):
 @pytest.mark.parametrize("steps", [0, 2, 9])
 def test_other_numbers_of_steps(steps):
     last = 1 + torch.arange(15, dtype=F64)[None]
-    rows = [block[steps:] + min(steps, H) * [0.0] for block in last.view(3, H).tolist()]
-    assert carried(PrimalDual(), last, steps)[0].tolist() == sum(rows, [])
+    blocks = [block[steps:] + min(steps, H) * [0.0] for block in last.view(3, H).tolist()]
+    assert carried(PrimalDual(), last, steps).view(3, H).tolist() == blocks
 
 
 @pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])

@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,22 @@ TASKS = {
     "swimmer": "cdiff_cli.tasks.locomotion:SWIMMER",
     "gaussian2d": "cdiff_cli.tasks.gaussian2d:GAUSSIAN2D",
 }
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How near is near enough, in a task's own units.
+
+    position         up to which a plan under dynamics may miss a pinned coordinate, in the unit of each
+    clearance        how far inside the constraints plans under dynamics are made, in the units of g: the execution stays near the
+                     plan, not on it
+    velocity_weight  of a rate beside 1 for a position in the distance to the dynamics, s^2: a plan's places matter more than its
+                     rates
+    """
+
+    position: float = 1e-3
+    clearance: float = 5e-3
+    velocity_weight: float = 0.02
 
 
 class Task(Protocol):
@@ -52,6 +69,11 @@ class Task(Protocol):
     @property
     def dt(self) -> float:
         """Seconds between waypoints."""
+        ...
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """What planning takes for near enough."""
         ...
 
     def make_env(self, render: bool = False) -> Any: ...

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdiff_cli.tasks import Tolerances
 from cdiff_cli.tasks.obstacle import PATTERNS, beside
 
 Array = NDArray[np.float64]
@@ -39,6 +40,7 @@ class BallRun:
     velocities = ("vx", "vy")
     shared_scale = (("x", "y"), ("vx", "vy"))
     dt = DT
+    tolerances = Tolerances()
     actions = ("force_x", "force_y")
     invariant = ("x",)
     env_options = {"pattern": PATTERNS, "collide": (True, False)}

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cdiff_cli.constraint import Traj
 from cdiff_cli.diffusion import Schedule
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.tasks import Tolerances
 
 
 class Gaussian2D:
@@ -23,6 +24,7 @@ class Gaussian2D:
     velocities: tuple[str, ...] = ()
     shared_scale = (("x", "y"),)
     dt = 1.0
+    tolerances = Tolerances()
     scale = 1.5  # of the normalised coordinates
 
     def covariance(self) -> torch.Tensor:

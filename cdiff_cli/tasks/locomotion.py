@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.recipe import home, shown
+from cdiff_cli.tasks import Tolerances
 
 Array = NDArray[np.float64]
 
@@ -72,6 +73,8 @@ class Locomotion:
     invariant: tuple[str, ...] = ()
     observable: tuple[str, ...] = ()
     max_steps: int = 1000
+
+    tolerances = Tolerances()
 
     def make_env(self, render: bool = False, **options: Any) -> Any:
         """The Gymnasium environment; options are those of its constructor (width, height, camera_name, ...)."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli.errors import CdiffError
+from cdiff_cli.tasks import Tolerances
 
 Array = NDArray[np.float64]
 Cell = tuple[int, int]
@@ -47,6 +48,8 @@ class Maze2D:
     velocities = ("vx", "vy")
     shared_scale = (("x", "y"), ("vx", "vy"))
     dt = DT
+    tolerances = Tolerances()
+    footprint = BALL_RADIUS  # m, which a start and a goal must have free around them
     success_radius = SUCCESS_RADIUS
 
     def make_env(self, render: bool = False, max_steps: int = 10**9) -> Any:
