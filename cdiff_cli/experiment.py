@@ -129,7 +129,7 @@ def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
         "calls": plans.calls,
         "plan_ms": 1e3 * plans.total_s / n,
         "step_ms": 1e3 * plans.total_s / plans.calls,
-        "overhead": 100 * (plans.total_s - plans.network_s) / max(plans.network_s, 1e-9),
+        "overhead": metrics.overhead(plans.total_s, plans.network_s),
     }
     dynamics = resolved.checkpoint.dynamics if resolved.checkpoint else None
     effort = None if dynamics is None else metrics.effort(dynamics, plans.x)
@@ -137,7 +137,7 @@ def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
     for i, (seed, values) in enumerate(zip(resolved.seeds, measured, strict=True)):
         row: Row = resolved.row() | {"seed": seed} | values | {"polish": float(plans.polish[i])} | cost
         if resolved.checkpoint is not None:
-            row["smooth"] = float(values["jump"] <= 1.2 * resolved.checkpoint.card.data["jump_q999"])
+            row["smooth"] = float(metrics.smooth(values["jump"], resolved.checkpoint.card.data["jump_q999"]))
         if effort is not None:
             row |= {"effort": float(effort[0][i]), "feasible": float(effort[1][i])}
         rows.append(row)

@@ -57,6 +57,16 @@ def jump(x: Array, columns: Sequence[int]) -> Array:
     return _steps(x, columns).max(-1, initial=0.0)
 
 
+def smooth(jump: float, usual: float) -> bool:
+    """Whether a plan's largest jump is at most 1.2 times the data's 99.9 % quantile."""
+    return jump <= 1.2 * usual
+
+
+def overhead(total_s: float, network_s: float) -> float:
+    """Time outside the network over time inside it, %."""
+    return 100.0 * (total_s - network_s) / max(network_s, 1e-9)
+
+
 def mean_speed(x: Array, columns: Sequence[int], dt: float) -> Array:
     """Length of the path over its duration [n]."""
     return np.asarray(_steps(x, columns).sum(-1) / (dt * max(x.shape[1] - 1, 1)))
@@ -203,7 +213,7 @@ def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -
             "calls": float(np.nanmean(episodes.calls[i])) if len(made) else math.nan,
             "latency_ms": 1e3 * float(np.median(episodes.latency_s)),
             "latency_p95": 1e3 * float(np.quantile(episodes.latency_s, 0.95)),
-            "overhead": 100.0 * float(np.median(episodes.latency_s) / max(np.median(episodes.network_s), 1e-9) - 1.0),
+            "overhead": overhead(float(np.median(episodes.latency_s)), float(np.median(episodes.network_s))),
         }
         rows.append(row | {f"{name}s": float(np.nansum(told[i])) for name, told in episodes.info.items() if name == "contact"})
     return rows

@@ -224,12 +224,17 @@ class Group:
     cells: dict[str, Cell]
 
 
+def torn(smooth: float) -> float:
+    """1 where a plan is not smooth, else 0: told at comparison, from the saved column."""
+    return 1.0 - smooth
+
+
 def newest(rows: Sequence[Row]) -> dict[tuple[str, ...], dict[str, Row]]:
     """The rows of each group by seed, in order of task, constraints, preset and method; the last given of a seed wins."""
     found: dict[tuple[str, ...], dict[str, Row]] = {}
     for row in rows:
-        torn = {"torn": 1.0 - row["smooth"]} if isinstance(row.get("smooth"), float) else {}
-        found.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = row | torn
+        more = {"torn": torn(row["smooth"])} if isinstance(row.get("smooth"), float) else {}
+        found.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = row | more
     return {
         key: found[key] for key in sorted(found, key=lambda k: (k[0], k[1], _order(PRESET_ORDER, k[3]), _order(METHOD_ORDER, k[2])))
     }

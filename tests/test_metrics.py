@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cdiff_cli import metrics
 from cdiff_cli.constraint import Constraint, Waypoints, stack
 from cdiff_cli.levels import Affine
 from cdiff_cli.metrics import (
@@ -230,3 +231,13 @@ def test_a_single_plan_has_no_distance_to_the_mean_of_several():
     )
     assert "distance_paper" not in row
     assert row["distance"] == pytest.approx(1.0)
+
+
+def test_a_plan_is_smooth_up_to_a_fifth_more_than_the_data():
+    assert [metrics.smooth(jump, 0.5) for jump in (0.0, 0.59, 0.61)] == [True, True, False]
+
+
+def test_overhead_is_the_time_outside_the_network_over_that_inside():
+    assert metrics.overhead(3.0, 2.0) == 50.0
+    assert metrics.overhead(2.0, 2.0) == 0.0
+    assert np.isfinite(metrics.overhead(1.0, 0.0))

@@ -38,7 +38,7 @@ def planned(one: Resolved) -> list[str]:
     assert checkpoint is not None
     rows = metrics.plan_metrics(problem.task, g, plans.x, free.x, one.recipe.paper_units)
     violation, unbound = (metrics.violation(g, each.x) for each in (plans, free))
-    torn = np.mean([row["jump"] > 1.2 * checkpoint.card.data["jump_q999"] for row in rows])
+    torn = np.mean([not metrics.smooth(row["jump"], checkpoint.card.data["jump_q999"]) for row in rows])
     wall, worst = np.mean([row["wall"] for row in rows]), max(row["worst_waypoint"] for row in rows)
     distance = np.array([row["distance"] for row in rows])
     return [told(violation), f"{violation.sum() / unbound.sum():.3f}", f"{worst:.3f}", told(distance), f"{torn:.2f}", f"{wall:.2f}"]
