@@ -15,11 +15,11 @@ from torch import Tensor
 from cdiff_cli.approach import Approach
 from cdiff_cli.constraint import Chain, Pins, Rows, Traj
 from cdiff_cli.levels import Affine, Ellipsoid, times
+from cdiff_cli.nonnegative_qp import nonnegative_least
 
 SHORT = 32  # indices up to which all blocks are written out at once
 WIDE = 8  # width of the windows round runs of falls from which on their search pays
 SWEEPS = 3  # of that search; what they leave, the next round takes
-FLIPS = 1000  # changes of the active set; a handful is usual
 LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
 NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
 
@@ -263,12 +263,12 @@ def _scales(gamma: float, n: int, dtype: torch.dtype, device: torch.device) -> T
 
 
 def _nearest_under(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int) -> Rows:
-    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_flipping). Where that asks for
+    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_dual). Where that asks for
     less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.
     """
     one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
     D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)
-    v[:, free] += _by_flipping(D[:, free], v @ D.T, 1 / weight.double()[..., free])
+    v[:, free] += _by_dual(D[:, free], v @ D.T, 1 / weight.double()[..., free])
     if low is not None and bool((v < low).any()):
         order = len(chain.coefficients) - 1
         v = torch.maximum(v, low)
@@ -280,28 +280,10 @@ def _nearest_under(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, fi
     return v.to(h)
 
 
-def _by_flipping(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
+def _by_dual(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
     """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0 [batch, n], for D [r, n], b [batch, r], way [n] or [batch, n], by its dual:
 
         d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
-
-    Principal pivoting (Judice and Pires, 1994): given the set of rows where b + Q lam = 0, elsewhere lam = 0, all rows of a wrong
-    sign change sides at once; where that has not helped three times in a row, the last of them alone, which ends for certain.
     """
     Q = (D * way[..., None, :]) @ D.T
-    one, rounding = torch.eye(len(D), dtype=Q.dtype, device=Q.device), 1e-12 * (1 + b.abs().amax(1, keepdim=True))
-    active = b < -rounding
-    best, left = torch.full_like(b[:, :1], len(D) + 1), torch.full_like(b[:, :1], 3)
-    lam = torch.zeros_like(b)
-    for _ in range(FLIPS):
-        both = active[:, :, None] & active[:, None, :]
-        lam = torch.linalg.solve(torch.where(both, Q, one), torch.where(active, -b, 0.0))
-        wrong = torch.where(active, lam < 0, b + times(lam, Q) < -rounding)
-        if not bool(wrong.any()):
-            break
-        count = wrong.sum(1, keepdim=True)
-        left = torch.where(count < best, 3.0, left - 1)
-        best = torch.minimum(best, count.to(best))
-        last = wrong & (wrong.flip(1).cumsum(1).flip(1) == 1)
-        active = active ^ torch.where(left < 0, last, wrong)
-    return (lam.clamp_min(0) @ D) * way
+    return (nonnegative_least(Q, -b, 1e-12 * (1 + b.abs().amax(1, keepdim=True))) @ D) * way

@@ -22,6 +22,7 @@ from torch import Tensor
 from cdiff_cli.constraint import Chain, Constraint, Part, Segments, Traj, Waypoints
 from cdiff_cli.diffusion import Step
 from cdiff_cli.errors import InfeasibleError
+from cdiff_cli.nonnegative_qp import nonnegative_least
 from cdiff_cli.rates import Rate
 
 Variant = Literal["ros", "res", "tvs"]
@@ -134,40 +135,19 @@ def by_active_set(rows: Rows, u0: Tensor, r: float = 0.0) -> Tensor:
     if not bool(touched.any()):
         return u0
     A, d = rows.A[touched], over[touched].clamp_min(-1e9)  # rows that ask nothing have c = inf
-    lam = nonnegative_least(A @ A.mT + r**2 * torch.eye(A.shape[-2], dtype=A.dtype, device=A.device), d)
+    lam = _multipliers(A @ A.mT + r**2 * torch.eye(A.shape[-2], dtype=A.dtype, device=A.device), d)
     out = u0.clone()
     out[touched] = u0[touched] - (lam[:, None] @ A)[:, 0]
     _check(A, rows.c[touched], out[touched], r**2 * lam)
     return out
 
 
-def nonnegative_least(M: Tensor, d: Tensor, rounds: int = 200) -> Tensor:
-    """argmin over lam >= 0 of lam.M lam / 2 - d.lam for positive definite M [*, n, n], d [*, n]: block principal pivoting.
-
-    The active set takes in all rows of the wrong sign at once while that makes them fewer, and else, after three attempts, only
-    the last of them (Murty's rule, which ends for every positive definite M). Rows that depend on each other get a ridge.
-    """
-    n = d.shape[-1]
-    size = M.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp_min(1e-12)
-    eye = torch.eye(n, dtype=M.dtype, device=M.device)
-    M = M + 1e-11 * size * eye
+def _multipliers(M: Tensor, d: Tensor) -> Tensor:
+    """argmin over lam >= 0 of lam.M lam / 2 - d.lam, M [batch, n, n]; rows that depend on each other get a ridge."""
+    size = M.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True).clamp_min(1e-12)
+    M = M + 1e-11 * size[..., None] * torch.eye(d.shape[-1], dtype=M.dtype, device=M.device)
     tolerance = 1e-10 * (d.abs().where(d > -1e8, 0.0).amax(-1, keepdim=True) + 1e-6)
-    active, lam = d > 0, torch.zeros_like(d)
-    fewest, attempts = torch.full_like(d[..., 0], n + 1), torch.full_like(d[..., 0], 3)
-    for _ in range(rounds):
-        pairs = active[..., :, None] & active[..., None, :]
-        system = torch.where(pairs, M, 0.0) + torch.where(active, 0.0, size[..., 0])[..., None] * eye
-        lam = torch.linalg.solve(system, torch.where(active, d, 0.0))
-        gap = (M @ lam[..., None])[..., 0] - d
-        wrong = torch.where(active, lam * size[..., 0], gap) < -tolerance
-        count = wrong.sum(-1)
-        if not bool(count.any()):
-            break
-        attempts = torch.where(count < fewest, 3.0, attempts - 1)
-        fewest = torch.minimum(fewest, count.to(fewest))
-        last = wrong & (wrong.flip(-1).cumsum(-1).flip(-1) == 1)
-        active = active ^ torch.where((attempts > 0)[..., None], wrong, last)
-    return lam.clamp_min(0)
+    return nonnegative_least(M, d, tolerance, tolerance / size)
 
 
 def by_proxqp(rows: Rows, u0: Tensor, r: float = 0.0) -> Tensor:

@@ -16,6 +16,7 @@ RANKS = {
     "errors": 0,
     "progress": 0,
     "inference": 0,
+    "nonnegative_qp": 0,
     "config": 1,
     "levels": 1,
     "affine_rows": 1,

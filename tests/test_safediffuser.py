@@ -13,7 +13,7 @@ from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.methods import Unconstrained, make_method
 from cdiff_cli.opaque import Opaque
-from cdiff_cli.safediffuser import SafeDiffuser, jacobian, nonnegative_least, relaxation
+from cdiff_cli.safediffuser import SafeDiffuser, _multipliers, jacobian, relaxation
 from tests.problems import (
     F64,
     KINDS,
@@ -110,7 +110,7 @@ def test_the_dual_meets_its_optimality_conditions(n, k, seed):
     """lam >= 0, M lam >= d, lam.(M lam - d) = 0, where M = A A^T + I / 10 is positive definite."""
     A, d = normal(seed, 3, n, k), normal(seed + 1, 3, n)
     M = A @ A.mT + 0.1 * torch.eye(n, dtype=F64)
-    lam = nonnegative_least(M, d)
+    lam = _multipliers(M, d)
     gap = (M @ lam[..., None])[..., 0] - d
     assert float(lam.min()) >= 0
     assert float(gap.min()) >= -1e-7  # the ridge of 1e-11 |M|, |M| up to 50, times multipliers up to 100
