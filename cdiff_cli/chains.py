@@ -96,21 +96,14 @@ def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
 # plain chains ---------------------------------------------------------------------------------------------------------
 
 
-def nearest_chain(h: Rows, gamma: float, weight: Tensor, fixed: Tensor) -> Rows:
-    """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k where fixed.
+def _nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: int) -> Rows:
+    """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k outside first to last.
 
     In y_k = v_k / gamma^k this is isotonic regression: pooled adjacent violators. The fixed ends bound it, and a bounded
     isotonic regression is the clipped one. Computed in float64, returned in the dtype of h.
 
-    h [batch, n], weight [n] or [batch, n] > 0, fixed [n] (only a first and a last run of indices may be fixed)
+    h [batch, n], weight [n] or [batch, n] > 0
     """
-    free = torch.nonzero(~fixed)[:, 0]
-    first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
-    return _nearest_between(h, gamma, weight, first, last)
-
-
-def _nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: int) -> Rows:
-    """The same with the indices from first to before last free."""
     n = h.shape[1]
     if first == last:
         return h
@@ -283,7 +276,7 @@ def _nearest_under(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, fi
 def _by_dual(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
     """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0 [batch, n], for D [r, n], b [batch, r], way [n] or [batch, n], by its dual:
 
-        d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
+    d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
     """
     Q = (D * way[..., None, :]) @ D.T
     return (nonnegative_least(Q, -b, 1e-12 * (1 + b.abs().amax(1, keepdim=True))) @ D) * way

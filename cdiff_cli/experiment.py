@@ -87,7 +87,7 @@ def rollout_run(
         if pictures:
             _plan_pictures(run.path, resolved, plans, free)
             title = f"{task.name}, {resolved.options.method}: executed over planned"
-            figures.rollout_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
+            figures.plan_picture(run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title)
         if video:
             tick("video", 0, 1)
             figures.rollout_video(run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x)

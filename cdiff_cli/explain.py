@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.markup import escape
@@ -64,7 +65,7 @@ def explain(file: Path, picture: Path, out: Console) -> None:
         return
     picture.parent.mkdir(parents=True, exist_ok=True)
     sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
-    figures.constraint_picture(picture, task, fixed, sample, file.stem)
+    figures.plan_picture(picture, task, fixed, np.empty((0, 2, len(task.layout))), sample, file.stem)
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
 
 

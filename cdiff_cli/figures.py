@@ -46,11 +46,6 @@ def plan_picture(path: Path, task: Any, g: Constraint, x: Array, x_free: Array |
     _save(figure, path)
 
 
-def constraint_picture(path: Path, task: Any, g: Constraint, demonstrations: Array | None, title: str) -> None:
-    """The unsafe sets over some demonstrations."""
-    plan_picture(path, task, g, np.empty((0, 2, len(task.layout))), demonstrations, title)
-
-
 def convergence_picture(path: Path, traces: dict[str, Array]) -> None:
     """Total violation (mean over plans) against the network call, of the noisy sample and of its clean estimate."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
@@ -78,11 +73,6 @@ def chain_picture(path: Path, task: Any, g: Constraint, chain: Array, truth: Arr
         axis.contour(*_density(truth), levels=4, colors="k", linewidths=0.5)
     axis.set(xlim=(-4, 4), ylim=(-4, 4), aspect="equal", title=title)
     _save(figure, path)
-
-
-def rollout_picture(path: Path, task: Any, g: Constraint, executed: Array, plans: Array, title: str) -> None:
-    """Executed paths by time over the plans they followed."""
-    plan_picture(path, task, g, executed, plans, title)
 
 
 def rollout_video(path: Path, task: Any, g: Constraint, executed: Array, plans: Array, every: int = 2) -> None:

@@ -8,6 +8,7 @@ import qpsolvers
 import torch
 from scipy.optimize import nnls
 
+from cdiff_cli.chains import _nearest_between
 from cdiff_cli.constraint import Chain, Constraint, Pins, Waypoints
 from cdiff_cli.diffusion import Step
 from cdiff_cli.errors import SpecError
@@ -169,6 +170,13 @@ def draws(seed, *shape):
 
 
 QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupled ones with alpha = 1e-3 cost digits
+
+
+def nearest_chain(h, gamma, weight, fixed):
+    """The nearest chain as chains.py finds it, v_k = h_k where fixed [n]: a first and a last run of indices."""
+    free = torch.nonzero(~fixed)[:, 0]
+    first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
+    return _nearest_between(h, gamma, weight, first, last)
 
 
 def free_projection(g, z):

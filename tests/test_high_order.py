@@ -6,13 +6,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.chains import SHORT, nearest_chain, pool_violators
+from cdiff_cli.chains import SHORT, pool_violators
 from cdiff_cli.constraint import Chain, Constraint, Pins, Segments, Waypoints, pull_back
 from cdiff_cli.levels import Affine
 from cdiff_cli.projection import has_exact_form, project
 from cdiff_cli.safediffuser import jacobian
 from cdiff_cli.spec import Dcbf
-from tests.problems import F64, ball, dense_jacobian, ellipsoid, half_space, normal, num, pin, qp_project, vec
+from tests.problems import F64, ball, dense_jacobian, ellipsoid, half_space, nearest_chain, normal, num, pin, qp_project, vec
 
 LAYOUT = ("x", "y", "vx", "vy")
 seeds = st.integers(0, 10_000)

@@ -6,11 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.chains import nearest_chain, pool_violators
+from cdiff_cli.chains import pool_violators
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.levels import Affine
 from cdiff_cli.projection import project
-from tests.problems import F64, chain, normal, num, pin, qp_project, vec
+from tests.problems import F64, chain, nearest_chain, normal, num, pin, qp_project, vec
 
 QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; many coupled ones with alpha = 1e-3 cost digits
 
