@@ -47,7 +47,7 @@ Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda")]
 Random = Annotated[bool, typer.Option("--random", help="a random feasible start and goal for each plan")]
 NoDynamics = Annotated[bool, typer.Option("--no-dynamics", help="do not obey the fitted dynamics, whatever the preset says")]
 AsJson = Annotated[bool, typer.Option("--json", help="print one JSON object instead of the table")]
-Execute = Annotated[int | None, typer.Option(help="control: environment steps a plan is followed [default: the preset's]")]
+Execute = Annotated[int | None, typer.Option(help="control: environment steps a plan is followed [default: 1]")]
 Warm = Annotated[
     float | None, typer.Option(help="control: share of the diffusion steps redone on the last plan [default: from noise]")
 ]

@@ -19,14 +19,11 @@ def fit_inverse(
     inputs: Sequence[Array],
     horizon: int,
     spec: InverseSpec,
-    hidden: Tensor,
     seed: int,
     on_step: Callable[[int, int, float], None] | None = None,
 ) -> tuple[InverseDynamics, dict[str, float]]:
     """The model, and its R^2 (share of the inputs' variance explained) on episodes that it was not trained on: `windows` on those
     at least a horizon long, `branches` on the shorter ones, which hold random and strongly perturbed inputs.
-
-    hidden   True for coordinates that it is not shown   [dim]
     """
     if not inputs:
         raise CdiffError("this dataset has no inputs to fit the inverse dynamics to; choose one with actions, a Minari dataset")
@@ -40,7 +37,7 @@ def fit_inverse(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # weight initialisation draws from the global generator; fork_rng restores it
         net = InverseDynamics(x.shape[1], u.shape[1], spec.width)
-    net.load_state_dict(net.state_dict() | _scales(x, after, u, hidden))
+    net.load_state_dict(net.state_dict() | _scales(x, after, u))
     generator, optimiser = torch.Generator().manual_seed(seed), torch.optim.Adam(net.parameters(), spec.learning_rate)
     rate = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, spec.steps)
     for step in range(spec.steps):
@@ -62,11 +59,10 @@ def _transitions(x: Array, u: Array, ahead: int) -> tuple[Tensor, Tensor, Tensor
     return states[:n], states[ahead : ahead + n], torch.from_numpy(u[:n]).float()
 
 
-def _scales(x: Tensor, after: Tensor, u: Tensor, hidden: Tensor) -> dict[str, Tensor]:
-    """The model's buffers; a hidden coordinate is divided by so much that nothing of it is left."""
+def _scales(x: Tensor, after: Tensor, u: Tensor) -> dict[str, Tensor]:
+    """The model's buffers."""
     change = after - x
     scale = torch.stack((x.std(0), change.std(0))).clamp_min(1e-6)
-    scale[0, hidden] = torch.inf
     return {"centre": torch.stack((x.mean(0), change.mean(0))), "scale": scale, "low": u.amin(0), "high": u.amax(0)}
 
 

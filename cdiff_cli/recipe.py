@@ -46,7 +46,6 @@ class InverseSpec(Strict):
     """How the inverse dynamics model is trained.
 
     ahead   waypoints between the two states it is asked about: 1, or more where one input hardly moves the state
-    hidden  coordinates that it is not shown
     """
 
     width: Positive = 256
@@ -54,7 +53,6 @@ class InverseSpec(Strict):
     batch: Positive = 512
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     ahead: Positive = 1
-    hidden: tuple[str, ...] = ()
 
 
 class ReturnSpec(Strict):
@@ -116,8 +114,6 @@ class Preset(Strict):
     safety      where constraints hold that do not say so themselves
     dynamics    obey the checkpoint's linear dynamics too
     temperature factor on all noise
-    execute     environment steps a plan is followed, in control
-    warm        in control, share of the diffusion steps done again on the last plan; None: each plan from noise
     resume      in control, begin each plan from the multipliers that the last one ended with
     margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
     methods     each method's constants by its name
@@ -131,8 +127,6 @@ class Preset(Strict):
     safety: Literal["waypoints", "segments"] = "waypoints"
     dynamics: bool = False
     temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
-    execute: Positive = 1
-    warm: Annotated[float, Field(gt=0, le=1)] | None = None
     resume: bool = False
     margin: bool = False
     methods: dict[str, dict[str, Any]] = {}

@@ -118,8 +118,7 @@ def train(
             on_step(Status(step, steps, loss, "inverse dynamics"))
 
     if spec.inverse is not None:
-        hidden = torch.tensor([name in spec.inverse.hidden for name in task.layout])
-        inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, hidden, seed, told)
+        inverse, explained = fit_inverse(episodes, inputs, recipe.horizon, spec.inverse, seed, told)
     card = {
         "task": task.name,
         "recipe": size if condition is None else f"conditional-{condition.name}",

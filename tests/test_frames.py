@@ -77,20 +77,14 @@ def test_the_residual_network_hands_the_present_state_back():
 def fitted():
     """Forty long episodes and twenty short ones of the linear system, its inverse dynamics fitted."""
     pairs = [episode(seed, 100 if seed < 40 else 5) for seed in range(60)]
-    spec = InverseSpec(width=64, steps=400, batch=256, learning_rate=3e-3, hidden=("x",))
+    spec = InverseSpec(width=64, steps=400, batch=256, learning_rate=3e-3)
     episodes, inputs = zip(*pairs, strict=True)
-    return fit_inverse(episodes, inputs, 16, spec, torch.tensor([True, False, False]), 0)
+    return fit_inverse(episodes, inputs, 16, spec, 0)
 
 
 def test_the_inverse_dynamics_of_a_linear_system_are_found(fitted):
     assert fitted[1]["windows"] > 0.98
     assert fitted[1]["branches"] > 0.9
-
-
-def test_a_hidden_coordinate_changes_no_input(fitted):
-    x, after = normal(0, 6, 3).float(), normal(1, 6, 3).float()
-    moved = torch.tensor([5.0, 0.0, 0.0])
-    assert torch.equal(fitted[0](x, after), fitted[0](x + moved, after + moved))
 
 
 def test_inputs_stay_within_those_of_the_data(fitted):
@@ -101,10 +95,10 @@ def test_inputs_stay_within_those_of_the_data(fitted):
 
 def test_without_inputs_there_is_no_inverse_dynamics_model():
     with pytest.raises(CdiffError, match="no inputs"):
-        fit_inverse([episode(0, 100)[0]], [], 16, InverseSpec(), torch.zeros(3, dtype=torch.bool), 0)
+        fit_inverse([episode(0, 100)[0]], [], 16, InverseSpec(), 0)
 
 
 def test_a_single_episode_is_fitted_to_and_none_is_held_out():
     x, u = episode(0, 40)
-    _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), torch.zeros(3, dtype=torch.bool), 0)
+    _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), 0)
     assert explained == {}

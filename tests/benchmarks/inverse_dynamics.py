@@ -67,7 +67,7 @@ def main() -> None:
 
     for ahead in (1, 2, 4, 8):
         spec = InverseSpec(steps=8000, ahead=ahead)
-        net, fits = fit_inverse(episodes, inputs, recipe.horizon, spec, torch.zeros(4, dtype=torch.bool), 0)
+        net, fits = fit_inverse(episodes, inputs, recipe.horizon, spec, 0)
         told = f"{fits['windows']:.4f}", f"{fits['branches']:.4f}"
         add(f"network, {ahead} ahead", told, {m: replace(c, inverse=net, ahead=ahead) for m, c in both.items()})
     inverse, left = linear(episodes, inputs)
