@@ -128,19 +128,17 @@ class AugmentedLagrangian:
     noisy:  g at x_t,  x_{t-1} = reverse(x0) - c_t m^T dg(x_t)
     estimate:  the same with g and dg at x0
     clean:  g at x0 - lam_t^T dg(x0), the estimate as the multipliers known so far push it;
-            x0' = x0 - m^T dg,  x_{t-1} = reverse(x0'),  repeated `inner` times
+            x0' = x0 - m^T dg,  x_{t-1} = reverse(x0')
     lam_{t-1} = m,  rho_{t-1} = c rho_t
 
     rho          first penalty weight; on clean in units of the exact one, kept at most 1, where one half-space is met at once
     c            its growth a step
-    inner        rounds a step on clean: 1 is exact where each row moves its own waypoint, coupled rows need more
     coefficient, expectation, positive   as in PrimalDual
     """
 
     on: DualOn = "clean"
     rho: float = 0.5
     c: float = 1.02
-    inner: int = 1
     coefficient: Coefficient = "beta/2"
     expectation: Expectation = "per_sample"
     positive: Positive = "none"
@@ -161,10 +159,9 @@ class AugmentedLagrangian:
         flat = turned(g, step.x0, step.pins)
         rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
-        for _ in range(self.inner):
-            rows, pull, size = linearise(flat, x0, self.positive)
-            lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
-            x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
+        rows, pull, size = linearise(flat, x0, self.positive)
+        lam = multiplier(expect(rows / size.clamp_min(1e-12), self.expectation), lam, rho)
+        x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         return step.reverse(x0), AlmState(lam, self._grown(rho))
 
     def _grown(self, rho: float) -> float:

@@ -3,7 +3,18 @@
 import pytest
 import yaml
 
-from cdiff_cli.calibrations import Calibration, Conditions, Margin, choose, read_calibrations, write_calibration
+from cdiff_cli.calibrations import (
+    Calibration,
+    CalibrationFile,
+    Conditions,
+    Margin,
+    choose,
+    read_calibrations,
+    write_calibration,
+)
+from cdiff_cli.config import load
+from cdiff_cli.methods import make_method, settings_of
+from cdiff_cli.recipe import home
 
 NOW = Conditions(
     method="alm",
@@ -146,3 +157,11 @@ def test_a_set_that_says_nothing_of_returns_is_of_plans_that_were_asked_for_none
     path.write_text(yaml.safe_dump(content))
     assert chosen(read_calibrations(checkpoint)) == (0.1, "exact")
     assert chosen(read_calibrations(checkpoint), now(returns=2.0)) == (0.1, "other")
+
+
+def test_shipped_calibrations_name_settings_that_their_methods_have():
+    """One that named another would be taken for a calibration of something else."""
+    for path in sorted((home() / "models").glob("*/*.margins.yaml")):
+        for each in load(path, CalibrationFile).calibrated:
+            now = each.conditions
+            assert settings_of(now.method, make_method(now.method, now.settings)) == now.settings, path
