@@ -80,6 +80,7 @@ class Reachable:
 
     trailing: ClassVar = {"centre": 1, "scale": 1}
     spans = False  # between two states there is nothing to obey
+    affine = False  # rows are absolute values
 
     @classmethod
     def of(cls, name: str, dynamics: LinearDynamics, tolerance: float) -> "Reachable":
@@ -133,6 +134,9 @@ class Reachable:
     def segment_max(self, x: Traj) -> Rows:
         """A step's own row."""
         return self(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
 
     def on_segments(self) -> tuple[Part, ...]:
         return (self,)
