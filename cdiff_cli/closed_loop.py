@@ -34,7 +34,7 @@ def control_run(
     acting, options = controller(resolved), resolved.options
     env_options = parse_env(acting.task, options.env)
     with new_run(root, name or f"rollout-{options.task}-{options.method}-{options.preset}") as run:
-        recorder = control_figures.Recorder(run.path / f"rollout.{video}", acting) if video else None
+        recorder = control_figures.Recorder(run.path / f"rollout.{video}", acting.task, acting.g) if video else None
         env = env_options | ({"render": True} if video else {})
         done = control(acting, resolved.seeds, env, on_step=lambda k, n: tick("control", k, n), on_frame=recorder)
         levels = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
@@ -42,7 +42,7 @@ def control_run(
         _write(run.path, resolved, acting, done, rows)
         title = f"{options.task}, {options.method} ({options.preset}), n = {len(rows)}"
         if pictures:
-            control_figures.levels_picture(run.path / "rollout.png", acting, done, levels, title)
+            control_figures.levels_picture(run.path / "rollout.png", acting.task, acting.g, done, levels, title)
         if recorder:
             recorder.write(done, levels)
     warning = f"{_diverged(done)}; what they had done until then is kept" if done.diverged.any() else ""

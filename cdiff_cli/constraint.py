@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cdiff_cli.affine_rows import AffineRows
-from cdiff_cli.levels import Framed, Level, Quadric, moved, segment_max, take
+from cdiff_cli.levels import Framed, Level, Quadric, is_affine, moved, segment_max, take
 
 Traj = Float[Tensor, "batch horizon dim"]
 Rows = Float[Tensor, "batch n"]
@@ -72,6 +72,11 @@ class Part(Protocol):
         """Whether it asks anything of the segments between waypoints; one that does not is as safe there as at them."""
         ...
 
+    @property
+    def affine(self) -> bool:
+        """Whether the rows are affine in the trajectory, the same for every plan."""
+        ...
+
     def labels(self, horizon: int) -> list[str]: ...
     def __call__(self, x: Traj) -> Rows: ...
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
@@ -102,6 +107,12 @@ class Part(Protocol):
         """The largest unsafe value on the segments between waypoints [batch, horizon - 1]."""
         ...
 
+    def state_values(self, x: Traj) -> Rows:
+        """One value per state [batch, horizon], unsafe above 0: the level, -h of a barrier; of what joins states, the row that
+        ends there; of anything else, the plan's largest row.
+        """
+        ...
+
     def on_segments(self) -> "tuple[Part, ...]":
         """The parts that hold all along the segments, as far as the part's form allows; itself where they need no more."""
         ...
@@ -115,6 +126,10 @@ class Waypoints:
     level: Level
 
     spans = True
+
+    @property
+    def affine(self) -> bool:
+        return is_affine(self.level)
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}" for tau in range(horizon)]
@@ -145,6 +160,9 @@ class Waypoints:
             return self(x)
         return segment_max(self.level, x)
 
+    def state_values(self, x: Traj) -> Rows:
+        return self.level(x)
+
     def on_segments(self) -> "tuple[Part, ...]":
         return (self if self.level.convex else _segments(self.name, self.level),)
 
@@ -157,6 +175,7 @@ class Segments:
     level: Level
 
     spans = True
+    affine = False
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}~{tau + 1}" for tau in range(horizon - 1)]
@@ -190,7 +209,10 @@ class Segments:
     shift_level = shift
 
     def segment_max(self, x: Traj) -> Rows:
-        return Waypoints(self.name, self.level).segment_max(x)
+        return segment_max(self.level, x) if x.shape[1] > 1 else self.level(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return self.level(x)
 
     def on_segments(self) -> "tuple[Part, ...]":
         return (self,)
@@ -219,6 +241,10 @@ class Chain:
     ahead: Level | None = None
 
     spans = True
+
+    @property
+    def affine(self) -> bool:
+        return is_affine(self.acting)
 
     @property
     def acting(self) -> Level:
@@ -289,6 +315,9 @@ class Chain:
         """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
         return Waypoints(self.name, self.level).segment_max(x)
 
+    def state_values(self, x: Traj) -> Rows:
+        return self.level(x)
+
     def on_segments(self) -> "tuple[Part, ...]":
         """The chain, and its barrier on the segments where the chain does not give it."""
         if not self.level.convex:
@@ -307,7 +336,7 @@ class Bindable(Protocol):
 class Constraint:
     """g(x) <= 0, row by row: a tuple of parts, each in environment units or all pulled back.
 
-    condensed   the rows of all parts at once, where they are affine and someone has written them so (condensed.py)
+    condensed   the rows of all parts at once, where they are affine and someone has written them so (`condense`)
     """
 
     parts: tuple[Part, ...]
@@ -356,6 +385,20 @@ class Constraint:
             return total
 
         return torch.cat([e[0] for e in each], 1), pull, len(each) * torch.cat([e[2] for e in each], 1)
+
+    def state_values(self, x: Traj) -> Float[Tensor, "batch horizon parts"]:
+        """Each part's value at every state, unsafe above 0 (Part.state_values)."""
+        return torch.stack([part.state_values(x) for part in self.parts], -1) if self.parts else x.new_empty((*x.shape[:2], 0))
+
+    def condense(self, horizon: int, dim: int) -> AffineRows | None:
+        """The rows as one matrix, float64, from their values and pulls at 0; None where a part is not affine.
+
+        For short windows, where one call for all parts is faster than one call per part.
+        """
+        if not self.parts or not all(part.affine for part in self.parts):
+            return None
+        rows, pull, size = self.linearise(torch.zeros(1, horizon, dim, dtype=torch.float64))
+        return AffineRows(pull(torch.eye(rows.shape[1], dtype=torch.float64)).flatten(1), rows, size)
 
     def tighten(self, margin: float) -> "Constraint":
         """The constraint g <= -margin (margin in the units of g)."""

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from cdiff_cli.affine_rows import AffineRows
 from cdiff_cli.baselines import BestOf
-from cdiff_cli.condensed import condensed
 from cdiff_cli.conditioning import Seeing
 from cdiff_cli.constraint import Constraint, Pins, pull_back
 from cdiff_cli.diffusion import KERNELS, Denoiser, Method, Schedule, sample
@@ -80,7 +79,7 @@ class Controller:
     @cached_property
     def condensed(self) -> AffineRows | None:
         """The rows of what is obeyed as one matrix, float64, where they are affine and nothing has to be observed."""
-        return condensed(self.enforced, self.horizon, len(self.task.layout))
+        return self.enforced.condense(self.horizon, len(self.task.layout))
 
     @property
     def watchful(self) -> bool:

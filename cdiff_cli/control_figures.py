@@ -13,35 +13,36 @@ import torch
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray
 
-from cdiff_cli.control import Controller
+from cdiff_cli.constraint import Constraint
 from cdiff_cli.episodes import Episodes
+from cdiff_cli.tasks import ControlTask
 
 Array = NDArray[np.float64]
 UNSAFE, SAFE, FORESEEN = "#d1495b", "#1d4e89", "#9aa5b1"
 FRAME, FRAMES = 0.04, 250  # seconds a video frame at true speed; frames at most: longer episodes are shown faster
 
 
-def levels_picture(path: Path, controller: Controller, done: Episodes, levels: Array, title: str) -> None:
+def levels_picture(path: Path, task: ControlTask, g: Constraint, done: Episodes, levels: Array, title: str) -> None:
     """h = -f of every constraint along each episode (unsafe below 0), as executed; pale, as foreseen."""
-    parts, plane = controller.g.parts, len(controller.task.positions) == 2
+    parts, plane = g.parts, len(task.positions) == 2
     figure, axes = plt.subplots(max(len(parts), 1) + plane, 1, figsize=(9, 2.6 * (max(len(parts), 1) + plane)), squeeze=False)
-    time = np.arange(levels.shape[1]) * controller.task.dt
+    time = np.arange(levels.shape[1]) * task.dt
     for k, (axis, part) in enumerate(zip(axes[:, 0], parts, strict=False)):
         axis.plot(time, -done.foreseen[:, :, k].T, color=FORESEEN, lw=0.6)
         axis.plot(time, -levels[:, :, k].T, color=SAFE, lw=0.7, alpha=0.8)
         axis.axhline(0, color=UNSAFE, lw=1.2)
         axis.set(xlabel="time / s", ylabel=f"h of {part.name}")
     if plane:
-        _paths(axes[-1, 0], controller, done)
+        _paths(axes[-1, 0], task, done)
     axes[0, 0].set_title(title, fontsize=10)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def _paths(axis: Any, controller: Controller, done: Episodes) -> None:
+def _paths(axis: Any, task: ControlTask, done: Episodes) -> None:
     """Executed paths of the positions, and those of what is observed as `<name>.x, <name>.y`."""
-    at = [controller.task.layout.index(name) for name in controller.task.positions]
+    at = [task.layout.index(name) for name in task.positions]
     for path in done.x[..., at]:
         axis.plot(*path.T, color=SAFE, lw=0.8)
     for name in sorted({name.partition(".")[0] for name in done.observed}):
@@ -55,15 +56,15 @@ class Recorder:
     environment's own picture, or, of a task in the plane, its map: path, plan, obstacle, unsafe set.
     """
 
-    def __init__(self, path: Path, controller: Controller) -> None:
-        self.path, self.controller = path, controller
+    def __init__(self, path: Path, task: ControlTask, g: Constraint) -> None:
+        self.path, self.task, self.g = path, task, g
         self.frames: list[NDArray[np.uint8]] = []
         self.plans: list[Array] = []
-        self.every = max(round(FRAME / controller.task.dt), -(-controller.task.max_steps // FRAMES), 1)
+        self.every = max(round(FRAME / task.dt), -(-task.max_steps // FRAMES), 1)
 
     @property
     def plane(self) -> bool:
-        return len(self.controller.task.positions) == 2
+        return len(self.task.positions) == 2
 
     def __call__(self, tau: int, env: Any, plan: Array) -> None:
         if tau % self.every == 0:
@@ -82,8 +83,8 @@ class Recorder:
 
     def _composed(self, done: Episodes, levels: Array) -> Iterator[NDArray[np.uint8]]:
         figure, (scene, strip) = plt.subplots(2, 1, figsize=(6.4, 6.0), dpi=80, height_ratios=[2, 1], layout="constrained")
-        time = np.arange(len(levels)) * self.controller.task.dt
-        lines = [strip.plot([], [], lw=1.2, color=f"C{k}", label=part.name)[0] for k, part in enumerate(self.controller.g.parts)]
+        time = np.arange(len(levels)) * self.task.dt
+        lines = [strip.plot([], [], lw=1.2, color=f"C{k}", label=part.name)[0] for k, part in enumerate(self.g.parts)]
         strip.plot(time, -levels, lw=0.6, alpha=0.35, color="0.5")
         strip.axhline(0, color=UNSAFE, lw=1.2)
         strip.set(xlabel="time / s", ylabel="h, unsafe below 0")
@@ -105,7 +106,7 @@ class Recorder:
 
     def _map(self, scene: Any, done: Episodes, tau: int, plan: Array) -> None:
         """Five metres around the agent: its path, the plan followed, what is unsafe now."""
-        task, at = self.controller.task, [self.controller.task.layout.index(name) for name in self.controller.task.positions]
+        task, at = self.task, [self.task.layout.index(name) for name in self.task.positions]
         here = done.x[0, tau]
         x, y = here[at]
         scene.plot(*done.x[0, : tau + 1][:, at].T, color=SAFE, lw=1.5)
@@ -115,7 +116,7 @@ class Recorder:
         grid = np.broadcast_to(here, (*xs.shape, len(here))).copy()
         grid[..., at[0]], grid[..., at[1]] = xs, ys
         seen = {name: torch.tensor([values[0, tau]]) for name, values in done.observed.items()}
-        for part in self.controller.g.bind(seen, task.dt, 1).parts:
+        for part in self.g.bind(seen, task.dt, 1).parts:
             level = getattr(part, "level", None)
             if level is not None:
                 value = level(torch.from_numpy(grid.reshape(1, -1, 1, len(here)).swapaxes(0, 1))).numpy().reshape(xs.shape)

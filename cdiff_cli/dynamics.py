@@ -77,6 +77,7 @@ class Reachable:
 
     trailing: ClassVar = {"centre": 1, "scale": 1}
     spans = False  # between two states there is nothing to obey
+    affine = False  # rows are absolute values
 
     @classmethod
     def of(cls, name: str, dynamics: LinearDynamics, tolerance: float) -> "Reachable":
@@ -130,6 +131,9 @@ class Reachable:
     def segment_max(self, x: Traj) -> Rows:
         """A step's own row."""
         return self(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
 
     def on_segments(self) -> tuple[Part, ...]:
         return (self,)

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint
-from cdiff_cli.metrics import level_values
 from cdiff_cli.tasks import ControlTask
 
 Array = NDArray[np.float64]
@@ -82,7 +81,7 @@ class Log:
         self.violation[which, tau] = g(torch.from_numpy(x)).clamp_min(0).sum(1).numpy()
         self.latency.append(total_s)
         self.network.append(network_s)
-        self.levels = level_values(g, x)
+        self.levels = g.state_values(torch.from_numpy(x)).numpy()
         self.rows = {int(i): row for row, i in enumerate(which)}
 
     def end(self, flags: NDArray[np.bool_], which: NDArray[np.intp], ended: Any) -> NDArray[np.intp]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from cdiff_cli.conditioning import Condition, Telling, drop
 from cdiff_cli.data import Array, Normaliser, Windows
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.frames import Frame
+from cdiff_cli.frames import Frame, fit_frame
 from cdiff_cli.recipe import Recipe, TrainSpec
 from cdiff_cli.returns import Returns
 from cdiff_cli.tasks import ControlTask, Task
@@ -104,7 +104,7 @@ class Data:
         pinned = end_pins(recipe.horizon, len(task.layout))
         if recipe.frame == "relative":
             windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
-            frame = Frame.fit(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
+            frame = fit_frame(windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant)
             pinned[-1] = False
             return cls(windows, frame.state, frame, pinned, *asked)
         normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)

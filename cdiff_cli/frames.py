@@ -31,26 +31,6 @@ class Frame:
     gain: Tensor
     scale: Tensor
 
-    @classmethod
-    def fit(cls, windows: Windows, layout: Sequence[str], shared: Sequence[Sequence[str]], invariant: Sequence[str]) -> "Frame":
-        """The frame of the windows (raw states); coordinates of a shared group share their scales."""
-        every = torch.arange(len(windows.starts))
-        x = windows[every[:: max(1, len(every) // SAMPLED)]].double()
-        ahead, spread = x - x[:, :1], x[:, 0].std(0)
-        for group in shared:
-            columns = [layout.index(name) for name in group]
-            spread[columns] = spread[columns].max()
-        state, seen = Normaliser(x[:, 0].mean(0), spread.clamp_min(LEAST)), torch.tensor([name not in invariant for name in layout])
-        told = torch.where(seen, state.encode(x[:, 0]), 0.0)
-        known = torch.cat((told, torch.ones_like(told[:, :1])), 1)
-        found = torch.linalg.lstsq(known, ahead.flatten(1), driver="gelsd").solution.unflatten(1, ahead.shape[1:])
-        gain, mean = found[:-1].permute(1, 2, 0), found[-1]
-        scale = (ahead - mean - torch.einsum("kij,nj->nki", gain, told)).std(0)
-        for group in shared:
-            columns = [layout.index(name) for name in group]
-            scale[:, columns] = scale[:, columns].amax(1, keepdim=True)
-        return cls(state, seen, mean, gain, scale.clamp_min(LEAST))
-
     def at(self, present: Tensor) -> Normaliser:
         """The affine map between z and windows that begin at the states `present` [batch, dim]: centre [batch, horizon, dim],
         scale [horizon, dim].
@@ -66,3 +46,23 @@ class Frame:
     def encode(self, x: Tensor) -> Tensor:
         """z of windows x [batch, horizon, dim]."""
         return self.at(x[:, 0]).encode(x)
+
+
+def fit_frame(windows: Windows, layout: Sequence[str], shared: Sequence[Sequence[str]], invariant: Sequence[str]) -> Frame:
+    """The frame of the windows (raw states); coordinates of a shared group share their scales."""
+    every = torch.arange(len(windows.starts))
+    x = windows[every[:: max(1, len(every) // SAMPLED)]].double()
+    ahead, spread = x - x[:, :1], x[:, 0].std(0)
+    for group in shared:
+        columns = [layout.index(name) for name in group]
+        spread[columns] = spread[columns].max()
+    state, seen = Normaliser(x[:, 0].mean(0), spread.clamp_min(LEAST)), torch.tensor([name not in invariant for name in layout])
+    told = torch.where(seen, state.encode(x[:, 0]), 0.0)
+    known = torch.cat((told, torch.ones_like(told[:, :1])), 1)
+    found = torch.linalg.lstsq(known, ahead.flatten(1), driver="gelsd").solution.unflatten(1, ahead.shape[1:])
+    gain, mean = found[:-1].permute(1, 2, 0), found[-1]
+    scale = (ahead - mean - torch.einsum("kij,nj->nki", gain, told)).std(0)
+    for group in shared:
+        columns = [layout.index(name) for name in group]
+        scale[:, columns] = scale[:, columns].amax(1, keepdim=True)
+    return Frame(state, seen, mean, gain, scale.clamp_min(LEAST))

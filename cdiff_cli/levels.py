@@ -317,6 +317,11 @@ class Ellipsoid:
         return Quadric(-self.side * weight @ self.which, -self.side * q, r)
 
 
+def is_affine(level: Level) -> bool:
+    """Whether f is affine, and the same function for every plan and waypoint."""
+    return isinstance(level, Affine) and level.a.ndim == 1
+
+
 def segment_max(level: Level, x: Tensor) -> Tensor:
     """The largest f on the segments of trajectories [..., horizon, dim], exactly [..., horizon - 1]."""
     f = level(x)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cdiff_cli.constraint import Constraint
 from cdiff_cli.dynamics import LinearDynamics
-from cdiff_cli.rates import Rate
 from cdiff_cli.tasks import Task
 
 Array = NDArray[np.float64]
@@ -146,9 +145,7 @@ def rollout_metrics(
     """The metrics of each executed episode; states after its end are NaN."""
     rows = _rows(g, x)
     steps = np.isfinite(x).all(-1).sum(1) - 1
-    unsafe = np.zeros(x.shape[:2], dtype=bool)
-    for part in g.parts:
-        unsafe |= _unsafe_states(part, x)
+    unsafe = (g.state_values(torch.from_numpy(x)) > SAFE).any(-1).numpy()
     return [
         {
             "reward": float(np.nansum(reward[i])),
@@ -164,23 +161,14 @@ def rollout_metrics(
     ]
 
 
-def level_values(g: Constraint, x: Array) -> Array:
-    """Value of each part's level at every state [n, steps + 1, parts]: -h of a barrier; of a part without, its largest row."""
-    states = torch.from_numpy(np.ascontiguousarray(x, dtype=np.float64))
-    each = []
-    for part in g.parts:
-        level = getattr(part, "level", None)
-        each.append(part(states).amax(1, keepdim=True).expand(x.shape[:2]) if level is None else level(states))
-    return np.stack([np.asarray(values) for values in each], -1) if each else np.empty((*x.shape[:2], 0))
-
-
 def executed_levels(g: Constraint, x: Array, observed: Mapping[str, Array], dt: float) -> Array:
-    """The same of executed states, each against what was observed at its own time [n, steps + 1, parts].
+    """Value of each part's level at every executed state, each against what was observed at its own time [n, steps + 1, parts].
 
     observed   quantities by name, each [n, steps + 1]
     """
     flat = {name: torch.from_numpy(values.reshape(-1)) for name, values in observed.items()}
-    return level_values(g.bind(flat, dt, 1), x.reshape(-1, 1, x.shape[-1])).reshape(*x.shape[:2], len(g.parts))
+    states = torch.from_numpy(np.ascontiguousarray(x.reshape(-1, 1, x.shape[-1]), dtype=np.float64))
+    return g.bind(flat, dt, 1).state_values(states).numpy().reshape(*x.shape[:2], len(g.parts))
 
 
 def control_metrics(episodes: Any, levels: Array, bounds: tuple[Array, Array]) -> list[dict[str, float]]:
@@ -237,14 +225,3 @@ def _largest(rows: torch.Tensor) -> torch.Tensor:
 
 def _steps(x: Array, columns: Sequence[int]) -> Array:
     return np.asarray(np.linalg.norm(np.diff(x[..., columns], axis=1), axis=-1))
-
-
-def _unsafe_states(part: Any, x: Array) -> NDArray[np.bool_]:
-    """Which states [n, steps + 1] are unsafe: f > 0, for a barrier chain h < 0, else those that no step leads to."""
-    level = getattr(part, "level", None)
-    values = part(torch.from_numpy(x)) if level is None else level(torch.from_numpy(x))
-    if not part.spans or isinstance(part, Rate):
-        values = torch.nn.functional.pad(values, (1, 0), value=-torch.inf)
-    elif level is None:
-        values = values.amax(1, keepdim=True)
-    return np.broadcast_to((values > SAFE).numpy(), x.shape[:2])

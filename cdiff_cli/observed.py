@@ -30,6 +30,7 @@ class Observed:
     changes: tuple[Callable[[Part], Sequence[Part]], ...] = ()
 
     spans = True
+    affine = False
 
     def bind(self, observed: Seen, dt: float, horizon: int) -> tuple[Part, ...]:
         """The part, filled in; CdiffError where a quantity is missing."""
@@ -77,6 +78,9 @@ class Observed:
         self.refuse()
 
     def segment_max(self, x: Traj) -> Rows:
+        self.refuse()
+
+    def state_values(self, x: Traj) -> Rows:
         self.refuse()
 
     def refuse(self) -> NoReturn:

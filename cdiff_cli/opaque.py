@@ -29,6 +29,7 @@ class Opaque:
 
     trailing: ClassVar = {"centre": 1, "scale": 1}
     spans = True
+    affine = False
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{i}" for i in range(self.count(horizon))]
@@ -67,6 +68,9 @@ class Opaque:
 
     def segment_max(self, x: Traj) -> Rows:
         return self(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return self(x).amax(1, keepdim=True).expand(x.shape[:2])
 
     def on_segments(self) -> "tuple[Part, ...]":
         """Nothing is known of it between the waypoints."""

@@ -44,6 +44,7 @@ class Rate:
 
     trailing: ClassVar = {"which": 2, "centre": 1, "scale": 1}
     spans = True
+    affine = False  # a row has two sides
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
@@ -103,6 +104,9 @@ class Rate:
     def segment_max(self, x: Traj) -> Rows:
         """A segment's own row: along it the rate does not change."""
         return self(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
 
     def on_segments(self) -> tuple[Part, ...]:
         return (self,)

@@ -58,7 +58,6 @@ RANKS = {
     "checkpoint": 9,
     "margins": 3,
     "calibrations": 3,
-    "condensed": 3,
     "episodes": 8,
     "resumed": 10,
     "control": 11,

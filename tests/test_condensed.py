@@ -4,7 +4,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.condensed import condensed
 from cdiff_cli.constraint import Chain, Constraint, Waypoints, pull_back
 from cdiff_cli.levels import Affine
 from tests.problems import F64, ball, chain, vec, waypoints
@@ -19,7 +18,7 @@ def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, al
     draw = torch.Generator().manual_seed(seed)
     a, b = torch.randn(2, 3, generator=draw, dtype=F64), torch.randn(2, generator=draw, dtype=F64)
     g = Constraint((Waypoints("w", Affine(a[0], b[0])), Chain("c", Affine(a[1], b[1]), alpha, alpha if high_order else None)))
-    rows = condensed(g, H, 3)
+    rows = g.condense(H, 3)
     assert rows is not None
     centre, y = torch.randn(2, 4, H, 3, generator=draw, dtype=F64)
     plain = pull_back(g, centre, torch.ones(3, dtype=F64))
@@ -33,7 +32,7 @@ def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, al
 
 
 def test_what_is_not_affine_is_left_part_by_part():
-    assert condensed(Constraint(()), H, 2) is None
-    assert condensed(waypoints(ball(1)), H, 2) is None
+    assert Constraint(()).condense(H, 2) is None
+    assert waypoints(ball(1)).condense(H, 2) is None
     both = Constraint((*chain(Affine(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5).parts, *waypoints(ball(1)).parts))
-    assert condensed(both, H, 2) is None
+    assert both.condense(H, 2) is None

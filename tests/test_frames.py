@@ -6,7 +6,7 @@ import torch
 
 from cdiff_cli.data import Windows
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.frames import Frame
+from cdiff_cli.frames import fit_frame
 from cdiff_cli.inverse import fit_inverse
 from cdiff_cli.networks import ResidualMlp
 from cdiff_cli.recipe import InverseSpec
@@ -27,7 +27,7 @@ def episode(seed: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 WINDOWS = Windows.of([episode(seed, 200)[0] for seed in range(4)], 8)
-FRAME = Frame.fit(WINDOWS, LAYOUT, (("x", "y"),), ("x",))
+FRAME = fit_frame(WINDOWS, LAYOUT, (("x", "y"),), ("x",))
 
 
 def windows(n: int = 50) -> torch.Tensor:
@@ -53,7 +53,7 @@ def test_what_follows_from_the_present_state_alone_is_in_the_frame():
     for _ in range(7):
         x.append(x[-1] @ torch.from_numpy(A).T)
     every = torch.stack(x, 1)
-    some = Frame.fit(Windows.of(list(every[:30].numpy()), 8), LAYOUT, (), ())
+    some = fit_frame(Windows.of(list(every[:30].numpy()), 8), LAYOUT, (), ())
     torch.testing.assert_close(some.at(every[30:, 0]).centre[:, 1:], every[30:, 1:])
 
 
