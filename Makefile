@@ -3,6 +3,9 @@ BIN := .venv/bin
 CALIBRATE := rollout --calibrate --level 0.99 --episodes 100 --seed 5000
 SLALOM := --constraints constraints/maze2d-umaze-slalom.yaml
 
+export OMP_WAIT_POLICY ?= PASSIVE  # threads that wait do not spin: two test processes share the cores
+export GOMP_SPINCOUNT ?= 0
+
 .PHONY: demo test lint tables benchmark oracle experts margins clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
@@ -24,14 +27,14 @@ tables: .venv/.ready  ## the tables of README.md and docs/results.md from runs/r
 	$(BIN)/python tests/readme_tables.py
 
 benchmark: .venv/.ready  ## timings, as ratios within one run
-	$(BIN)/python tests/benchmarks/constraint_share.py
+	$(BIN)/python tests/benchmarks/speed/constraint_share.py
 
 oracle: .venv/.ready  ## methods against the true constrained law, exact scores; several minutes
-	$(BIN)/python tests/benchmarks/oracle.py
+	$(BIN)/python tests/benchmarks/studies/oracle.py
 
 experts: .venv/.ready  ## search the gaits of models/*/expert.json anew; about 20 minutes
-	$(BIN)/python -m cdiff_cli.tasks.search swimmer --seed 0 1
-	$(BIN)/python -m cdiff_cli.tasks.search hopper --seed 0 5
+	$(BIN)/python -m cdiff_cli.tasks.mujoco.gait_search swimmer --seed 0 1
+	$(BIN)/python -m cdiff_cli.tasks.mujoco.gait_search hopper --seed 0 5
 
 margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml anew; an hour or more
 	for c in hopper hopper-hard swimmer swimmer-hard; do for m in alm projected primal-dual safediffuser; do \

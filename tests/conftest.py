@@ -1,4 +1,4 @@
-"""One thread a test process: the suite runs two of them, and equal seeds must give equal plans whatever the machine."""
+"""One thread per test process: the suite runs two of them, and equal seeds must give equal plans whatever the machine."""
 
 import torch
 

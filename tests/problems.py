@@ -8,14 +8,17 @@ import qpsolvers
 import torch
 from scipy.optimize import nnls
 
-from cdiff_cli.chains import _nearest_between
-from cdiff_cli.constraint import Chain, Constraint, Pins, Waypoints
-from cdiff_cli.diffusion import Step
+from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.black_box import Opaque
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.spec.load import load_constraints
+from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Quadric
+from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.constraints.waypoints import Waypoints
 from cdiff_cli.errors import SpecError
-from cdiff_cli.levels import Affine, Ellipsoid, Quadric
-from cdiff_cli.opaque import Opaque
-from cdiff_cli.projection import project
-from cdiff_cli.spec import load_constraints
+from cdiff_cli.projection.project import project
+from cdiff_cli.projection.solvers.isotonic import _nearest_between
+from cdiff_cli.sampling.sampler import Step
 
 LAYOUT = ("x", "y", "vx", "vy")
 F64 = torch.float64
@@ -46,11 +49,19 @@ def half_space(a=(1.0, -1.0), b=0.2):
 
 def ball(side, centre=(0.3, -0.2), radius=0.7, dim=None):
     k, dim = len(centre), dim or len(centre)
-    return Ellipsoid(torch.eye(k, dim, dtype=F64), vec(*centre), torch.full((k,), radius, dtype=F64), num(radius), side)
+    return Ellipsoid(
+        torch.eye(k, dim, dtype=F64),
+        vec(*centre),
+        torch.full((k,), radius, dtype=F64),
+        num(radius),
+        side,
+    )
 
 
 def ellipsoid(side, centre=(0.3, -0.2), axes=(0.5, 1.2)):
-    return Ellipsoid(torch.eye(len(axes), dtype=F64), vec(*centre), vec(*axes), num(min(axes)), side)
+    return Ellipsoid(
+        torch.eye(len(axes), dtype=F64), vec(*centre), vec(*axes), num(min(axes)), side
+    )
 
 
 def saddle():
@@ -86,7 +97,9 @@ KINDS = {
     **{name: waypoints(level) for name, level in LEVELS.items()},
     **{f"dcbf over {name}": chain(level, 0.3) for name, level in LEVELS.items()},
     "opaque": opaque(lambda x: (x**3).sum(-1) - 0.5),
-    "stack": Constraint((Waypoints("a", half_space()), Chain("b", ball(1), 0.4), Waypoints("e", ellipsoid(-1)))),
+    "stack": Constraint(
+        (Waypoints("a", half_space()), Chain("b", ball(1), 0.4), Waypoints("e", ellipsoid(-1)))
+    ),
 }
 
 
@@ -108,7 +121,15 @@ def qp_project(A, b, z, fixed=None):
     """min |x - z|^2 s.t. A x <= b, x = z where fixed; by ProxQP's dense backend, about 1e-9 exact."""
     E = np.eye(len(z))[fixed] if fixed is not None and fixed.any() else None
     x = qpsolvers.solve_qp(
-        np.eye(len(z)), -z, A, b, E, None if E is None else z[fixed], solver="proxqp", eps_abs=1e-10, eps_rel=0.0
+        np.eye(len(z)),
+        -z,
+        A,
+        b,
+        E,
+        None if E is None else z[fixed],
+        solver="proxqp",
+        eps_abs=1e-10,
+        eps_rel=0.0,
     )
     assert x is not None
     return x
@@ -136,7 +157,9 @@ def nearest_of(points, z):
 
 # samplers with known answers ------------------------------------------------------------------------------------------
 
-UNIT_MEAN_SHIFT = waypoints(Affine(vec(-1.0), num(-1.0)))  # g(x) = 1 - x: E x >= 1 turns N(0, 1) into N(1, 1), lam* = 1
+UNIT_MEAN_SHIFT = waypoints(
+    Affine(vec(-1.0), num(-1.0))
+)  # g(x) = 1 - x: E x >= 1 turns N(0, 1) into N(1, 1), lam* = 1
 
 
 def langevin_chain(method, g, *, steps, batch, beta, seed):
@@ -146,7 +169,9 @@ def langevin_chain(method, g, *, steps, batch, beta, seed):
     pins, state, states = Pins.none(x), method.init(x, g), []
     for _ in range(steps):
         z = torch.randn(x.shape, generator=rng, dtype=F64)
-        step = Step(x, x, beta, 1.0, lambda _, x=x, z=z: x - beta / 2 * x + math.sqrt(beta) * z, pins, False)
+        step = Step(
+            x, x, beta, 1.0, lambda _, x=x, z=z: x - beta / 2 * x + math.sqrt(beta) * z, pins, False
+        )
         x, state = method.step(step, g, state)
         states.append(state)
     return x, states
@@ -173,7 +198,7 @@ QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupl
 
 
 def nearest_chain(h, gamma, weight, fixed):
-    """The nearest chain as chains.py finds it, v_k = h_k where fixed [n]: a first and a last run of indices."""
+    """The nearest chain as projection/barrier.py finds it, v_k = h_k where fixed [n]: a first and a last run of indices."""
     free = torch.nonzero(~fixed)[:, 0]
     first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
     return _nearest_between(h, gamma, weight, first, last)

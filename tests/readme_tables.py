@@ -9,7 +9,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from cdiff_cli import runs, tables
+from cdiff_cli.commands import run_directory
+from cdiff_cli.evaluation import columns, comparison, tables
 
 ROOT = Path(__file__).parent.parent
 REFERENCE = ROOT / "runs" / "reference"
@@ -17,42 +18,107 @@ PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 MARKED = re.compile(r"(<!-- table (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 PAPER = (
-    *("distance", "distance_paper", "violation", "violation_paper", "worst_segment", "unsafe_segments"),
+    *(
+        "distance",
+        "distance_paper",
+        "violation",
+        "violation_paper",
+        "worst_segment",
+        "unsafe_segments",
+    ),
     *("jump", "torn", "wall", "calls"),
 )
 FEW = ("distance", "wall", "residual", "effort", "safe_segments", "safe_executed", "success")
-SAFETY = (*runs.SAFETY_TABLE[:-2], "torn", "distance")
+SAFETY = (*columns.SAFETY_TABLE[:-2], "torn", "distance")
 BRIEF = ("distance", "violation_paper", "unsafe_segments", "torn", "wall")
 IN_BRIEF = ("reward", "violation_rate", "executed_violation", "safe_executed", "fell")
-CONTROL = ("reward", "plan_violation", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "fell", "calls")
-BALL = ("reward", "violation_rate", "executed_violation", "executed_worst", "safe_executed", "contacts", "braked", "calls")
-QUALITY = ("wall", "smooth", "success", "jump", "residual", "acceleration", "effort", "goal_distance")
+CONTROL = (
+    "reward",
+    "plan_violation",
+    "violation_rate",
+    "executed_violation",
+    "executed_worst",
+    "safe_executed",
+    "fell",
+    "calls",
+)
+BALL = (
+    "reward",
+    "violation_rate",
+    "executed_violation",
+    "executed_worst",
+    "safe_executed",
+    "contacts",
+    "braked",
+    "calls",
+)
+QUALITY = (
+    "wall",
+    "smooth",
+    "success",
+    "jump",
+    "residual",
+    "acceleration",
+    "effort",
+    "goal_distance",
+)
 
 
 def of_rows(name: str, columns: tuple[str, ...], paper: bool = False) -> str:
     """A comparison of the rows in runs/reference/NAME/rows.csv."""
     values = tables.read_paper(REFERENCE / "paper.csv") if paper else None
-    return tables.render(runs.compare(runs.read_rows(REFERENCE / name / "rows.csv")), columns, "markdown", values)
+    return tables.render(
+        comparison.compare(run_directory.read_rows(REFERENCE / name / "rows.csv")),
+        columns,
+        "markdown",
+        values,
+    )
 
 
-def in_short(names: tuple[str, ...], columns: tuple[str, ...], shown: tuple[tuple[str, str], ...], paper: bool = False) -> str:
+def in_short(
+    names: tuple[str, ...],
+    columns: tuple[str, ...],
+    shown: tuple[tuple[str, str], ...],
+    paper: bool = False,
+) -> str:
     """The same of several, one (method, preset) of `shown` after the other for each constraint file."""
     values = tables.read_paper(REFERENCE / "paper.csv") if paper else None
-    groups = [group for name in names for group in runs.compare(runs.read_rows(REFERENCE / name / "rows.csv"))]
+    groups = [
+        group
+        for name in names
+        for group in comparison.compare(run_directory.read_rows(REFERENCE / name / "rows.csv"))
+    ]
     found = {group.key: group for group in groups}
-    asked = [(*files, *pair) for files in dict.fromkeys(group.key[:2] for group in groups) for pair in shown]
+    asked = [
+        (*files, *pair)
+        for files in dict.fromkeys(group.key[:2] for group in groups)
+        for pair in shown
+    ]
     return tables.render([found[key] for key in asked if key in found], columns, "markdown", values)
 
 
 def of_metrics() -> str:
     """What each column means."""
-    lines = [f"| {column.title} | {column.meaning.replace('|', '&#124;')} |" for column in runs.COLUMNS.values()]
+    lines = [
+        f"| {column.title} | {column.meaning.replace('|', '&#124;')} |"
+        for column in columns.COLUMNS.values()
+    ]
     return "\n".join(["| column | definition |", "| --- | --- |", *lines])
 
 
 MAZES = (
-    *(("diffuser", "paper"), ("conditional", "paper"), ("safediffuser", "paper"), ("projected", "paper")),
-    *(("primal-dual", "released"), ("alm", "released"), ("projected", "recommended"), ("alm", "recommended")),
+    *(
+        ("diffuser", "paper"),
+        ("conditional", "paper"),
+        ("safediffuser", "paper"),
+        ("projected", "paper"),
+    ),
+    *(
+        ("primal-dual", "released"),
+        ("alm", "released"),
+        ("projected", "recommended"),
+        ("alm", "recommended"),
+    ),
 )
 THREE = (("diffuser", "recommended"), ("projected", "paper"), ("alm", "recommended"))
 ACTING = (
@@ -61,9 +127,13 @@ ACTING = (
 )
 
 TABLES: dict[str, Callable[[], str]] = {
-    "safety-short": lambda: in_short(("safety-umaze", "safety-large"), (*SAFETY[:4], "distance"), THREE),
+    "safety-short": lambda: in_short(
+        ("safety-umaze", "safety-large"), (*SAFETY[:4], "distance"), THREE
+    ),
     "table1-short": lambda: in_short(("table1-umaze", "table1-large"), BRIEF, MAZES, paper=True),
-    "table2-short": lambda: in_short(("table2-hopper", "table2-swimmer"), IN_BRIEF, ACTING, paper=True),
+    "table2-short": lambda: in_short(
+        ("table2-hopper", "table2-swimmer"), IN_BRIEF, ACTING, paper=True
+    ),
     "table1-umaze": lambda: of_rows("table1-umaze", PAPER, paper=True),
     "table1-large": lambda: of_rows("table1-large", PAPER, paper=True),
     "safety-umaze": lambda: of_rows("safety-umaze", SAFETY),
@@ -87,4 +157,8 @@ if __name__ == "__main__":
     for page in PAGES:
         old = page.read_text()
         page.write_text(filled(old))
-        sys.stderr.write(f"{page.name}: its tables are up to date\n" if filled(old) == old else f"{page.name}: tables rewritten\n")
+        sys.stderr.write(
+            f"{page.name}: its tables are up to date\n"
+            if filled(old) == old
+            else f"{page.name}: tables rewritten\n"
+        )

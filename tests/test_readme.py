@@ -1,9 +1,9 @@
 """The tables of the README and docs/results.md are those of runs/reference/."""
 
 import pytest
-from readme_tables import MARKED, PAGES, TABLES, filled
 
-from cdiff_cli.runs import COLUMNS
+from cdiff_cli.evaluation.columns import COLUMNS
+from tests.readme_tables import MARKED, PAGES, TABLES, filled
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -13,7 +13,9 @@ def test_every_table_is_what_its_rows_say(page):
 
 
 def test_every_table_has_its_place():
-    assert sorted(name for page in PAGES for _, name, _ in MARKED.findall(page.read_text())) == sorted(TABLES)
+    assert sorted(
+        name for page in PAGES for _, name, _ in MARKED.findall(page.read_text())
+    ) == sorted(TABLES)
 
 
 def test_every_column_is_defined():

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cdiff_cli.constraint import Traj
-from cdiff_cli.diffusion import Schedule
+from cdiff_cli.arrays import Traj
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.tasks import Tolerances
+from cdiff_cli.models.schedule import Schedule
+from cdiff_cli.tasks.protocol import Tolerances
 
 
 class Gaussian2D:
@@ -39,7 +39,11 @@ class Gaussian2D:
 
         def clean(x: Traj, t: int) -> Traj:
             a = level[t]
-            gain = math.sqrt(a) * covariance @ torch.linalg.inv(a * covariance + (1 - a) * torch.eye(2, dtype=torch.float64))
+            gain = (
+                math.sqrt(a)
+                * covariance
+                @ torch.linalg.inv(a * covariance + (1 - a) * torch.eye(2, dtype=torch.float64))
+            )
             return x @ gain.T.to(x)
 
         return clean
@@ -53,7 +57,9 @@ class Gaussian2D:
         return np.empty((0, 4))
 
     def make_env(self, render: bool = False) -> Any:
-        raise CdiffError("gaussian2d is a distribution, not an environment: it can be planned, not rolled out or trained")
+        raise CdiffError(
+            "gaussian2d is a distribution, not an environment: it can be planned, not rolled out or trained"
+        )
 
     def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]:
         raise CdiffError("gaussian2d needs no training: its score is exact")

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdiff_cli.arrays import Array
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.tasks import Tolerances
+from cdiff_cli.tasks.protocol import Tolerances
 
-Array = NDArray[np.float64]
 Cell = tuple[int, int]
-
 DT = 0.01
 BALL_RADIUS = 0.1
 MAX_SPEED = 5.0
@@ -100,7 +98,9 @@ class Maze2D:
         return np.array([col + 0.5 - len(self.rows[0]) / 2, len(self.rows) / 2 - row - 0.5])
 
     def cell(self, point: Array) -> Cell:
-        return int(np.floor(len(self.rows) / 2 - point[1])), int(np.floor(point[0] + len(self.rows[0]) / 2))
+        return int(np.floor(len(self.rows) / 2 - point[1])), int(
+            np.floor(point[0] + len(self.rows[0]) / 2)
+        )
 
     def cells(self, kind: str) -> list[Cell]:
         return [(r, c) for r, row in enumerate(self.rows) for c, k in enumerate(row) if k == kind]
@@ -119,13 +119,17 @@ class Maze2D:
         nearest = np.clip(point, box[:, :2], box[:, 2:])
         return bool(np.linalg.norm(nearest - point, axis=1).min() > clearance)
 
-    def route(self, start: Array, goal: Array, cost: Callable[[Cell], float] = lambda _: 1.0) -> list[Cell]:
+    def route(
+        self, start: Array, goal: Array, cost: Callable[[Cell], float] = lambda _: 1.0
+    ) -> list[Cell]:
         """Cells of a cheapest path (Dijkstra over free cells), both ends included."""
         source, target = self.cell(start), self.cell(goal)
         free = set(self.cells(" "))
         for point, cell in ((start, source), (goal, target)):
             if cell not in free:
-                raise CdiffError(f"no route in {self.name}: the point ({point[0]:g}, {point[1]:g}) lies in a wall")
+                raise CdiffError(
+                    f"no route in {self.name}: the point ({point[0]:g}, {point[1]:g}) lies in a wall"
+                )
         done: dict[Cell, Cell | None] = {}
         queue: list[tuple[float, Cell, Cell | None]] = [(0.0, source, None)]
         while queue:
@@ -159,7 +163,9 @@ class Maze2D:
 
     # demonstrations ---------------------------------------------------------------------------------------------------
 
-    def demonstrate(self, n_steps: int, seed: int, episode_steps: int = 2000) -> Iterator[dict[str, Any]]:
+    def demonstrate(
+        self, n_steps: int, seed: int, episode_steps: int = 2000
+    ) -> Iterator[dict[str, Any]]:
         """Episodes of trips from rest to rest by a waypoint controller, n_steps environment steps in all.
 
         A trip goes to a random point along a shortest route over randomly weighted cells, its waypoints jittered by
@@ -186,10 +192,14 @@ class Maze2D:
             yield rows
         env.close()
 
-    def _trip(self, state: Callable[[], Array], goal: Array, rng: np.random.Generator) -> Iterator[Array]:
+    def _trip(
+        self, state: Callable[[], Array], goal: Array, rng: np.random.Generator
+    ) -> Iterator[Array]:
         """Forces of one trip from the present state to rest at the goal, and of the hold there."""
         weights: dict[Cell, float] = {}
-        route = self.route(state()[:2], goal, lambda cell: weights.setdefault(cell, rng.uniform(1.0, 1.6)))
+        route = self.route(
+            state()[:2], goal, lambda cell: weights.setdefault(cell, rng.uniform(1.0, 1.6))
+        )
         points = [*(self.centre(cell) + rng.uniform(-0.15, 0.15, 2) for cell in route[1:-1]), goal]
         top_speed, corner_speed = rng.uniform(2.8, 5.0), rng.uniform(2.0, 3.4)
         near, far = self.switch
@@ -215,7 +225,13 @@ class Maze2D:
             yield np.clip((wanted - v) * 0.6 + drift * min(1.0, distance / 0.3), -1.0, 1.0)
 
 
-UMAZE = Maze2D("maze2d-umaze", "PointMaze_UMaze-v3", 128, ("#####", "#   #", "### #", "#   #", "#####"), (0.05, 0.25))
+UMAZE = Maze2D(
+    "maze2d-umaze",
+    "PointMaze_UMaze-v3",
+    128,
+    ("#####", "#   #", "### #", "#   #", "#####"),
+    (0.05, 0.25),
+)
 LARGE = Maze2D(
     "maze2d-large",
     "PointMaze_Large-v3",

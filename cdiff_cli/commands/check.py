@@ -1,0 +1,102 @@
+"""`cdiff check`: what a constraint file means, as a table and a picture."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cdiff_cli.constraints.dynamics import Reachable
+from cdiff_cli.constraints.observed import Observed
+from cdiff_cli.constraints.rate import Rate
+from cdiff_cli.constraints.spec.load import load_constraints
+from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.evaluation.figures import plans as plan_figures
+from cdiff_cli.models.checkpoint import load_checkpoint
+from cdiff_cli.models.recipe import load_recipe
+from cdiff_cli.paths import home
+from cdiff_cli.projection.project import has_exact_form
+from cdiff_cli.tasks import load_task
+from cdiff_cli.yaml_files import Document
+
+
+def explain(file: Path, picture: Path, out: Console) -> None:
+    """Print the constraints of a file: rows, coordinates, units, projection, share of demonstrations that satisfy them; draw
+    them over those demonstrations.
+    """
+    document = Document(file)
+    name = document.value.get("task") if isinstance(document.value, dict) else None
+    if not isinstance(name, str):
+        raise document.error((), "the file must begin with `task: NAME` and a list `constraints:`")
+    task, recipe = load_task(name), load_recipe(name)
+    shipped = home() / "models" / name / "small.safetensors"
+    checkpoint = load_checkpoint(shipped, name) if shipped.exists() else None
+    fitted, observable = (
+        checkpoint.dynamics if checkpoint else None,
+        getattr(task, "observable", ()),
+    )
+    kinds, g = load_constraints(
+        file, name, task.layout, fitted, observable, getattr(task, "dt", None)
+    )
+    demonstrations = checkpoint.demonstrations.double() if checkpoint else None
+    unit = dict(zip(task.layout, task.units, strict=True))
+    count = "1 constraint" if len(kinds) == 1 else f"{len(kinds)} constraints, all of them at once,"
+    table = Table(title=f"{file}: {count} on {name}", title_justify="left")
+    for heading in (
+        "name",
+        "kind",
+        "meaning",
+        "rows",
+        "coordinates",
+        "projection",
+        "demonstrations that obey",
+    ):
+        table.add_column(heading, overflow="fold")
+    for spec, part in zip(kinds, g.parts, strict=True):
+        form = (
+            part.example(recipe.horizon)[0] if isinstance(part, Observed) else part
+        )  # its form, where its numbers are observed
+        used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
+        obey = (
+            ""
+            if demonstrations is None or form is not part
+            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+        )
+        table.add_row(
+            escape(spec.name),
+            spec.kind,
+            escape(spec.describe()),
+            str(len(form.labels(recipe.horizon))),
+            escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
+            _projection(form),
+            obey,
+        )
+    out.print(table)
+    fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
+    if len(task.positions) != 2:
+        out.print(
+            f"picture  none: the states of {name} have no place in the plane; `cdiff rollout` draws h over time"
+        )
+        return
+    if not fixed.parts:
+        out.print(
+            "picture  none: where these constraints lie is observed only while acting; `cdiff rollout` draws them"
+        )
+        return
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    sample = None if demonstrations is None else demonstrations.to(torch.float64).numpy()
+    plan_figures.plan_picture(
+        picture, task, fixed, np.empty((0, 2, len(task.layout))), sample, file.stem
+    )
+    out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
+
+
+def _projection(form: Part) -> str:
+    """How the nearest trajectory that obeys it is found (project.py)."""
+    if isinstance(form, Reachable):
+        return "active set"
+    if isinstance(form, Rate):
+        return "ADMM"
+    return "exact" if has_exact_form(form) else "sequential (ProxQP)"

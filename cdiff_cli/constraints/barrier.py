@@ -1,0 +1,116 @@
+"""Discrete control barrier functions along a trajectory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from cdiff_cli.arrays import Pull, Rows, Traj
+from cdiff_cli.constraints.segments import _segments
+from cdiff_cli.constraints.state_sets import Level, is_affine, moved, take
+from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.waypoints import Waypoints
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Discrete control barrier function h = -f:  (1 - alpha) h(x^tau) - h(x^{tau+1}) <= 0 (paper, section 5.1).
+
+    level    whose barrier is to stay non-negative
+    alpha2   of a high-order barrier, of psi^tau = h^{tau+1} - (1 - alpha) h^tau:  (1 - alpha2) psi^tau - psi^{tau+1} <= 0
+             (Xiong et al., 2022); None for the plain one
+    ahead    the level that the rows are of, where it is another: of the place that the velocity leads to
+    """
+
+    name: str
+    level: Level
+    alpha: float
+    alpha2: float | None = None
+    ahead: Level | None = None
+
+    spans = True
+
+    @property
+    def affine(self) -> bool:
+        return is_affine(self.acting)
+
+    @property
+    def acting(self) -> Level:
+        """The level that the rows are of."""
+        return self.level if self.ahead is None else self.ahead
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """c with the rows -(c_0 h^tau + c_1 h^{tau+1} + ... + h^{tau+order}) <= 0."""
+        gamma = 1 - self.alpha
+        if self.alpha2 is None:
+            return (-gamma, 1.0)
+        return (gamma * (1 - self.alpha2), -gamma - (1 - self.alpha2), 1.0)
+
+    def labels(self, horizon: int) -> list[str]:
+        order = len(self.coefficients) - 1
+        return [f"{self.name}@{tau}-{tau + order}" for tau in range(horizon - order)]
+
+    def rows_of(self, f: Rows) -> Rows:
+        """g where the level has the values f at the waypoints."""
+        c, n = self.coefficients, f.shape[1] - len(self.coefficients) + 1
+        if n < 1:
+            return f[:, :0]
+        rows = f[:, len(c) - 1 :]
+        for k, weight in enumerate(c[:-1]):
+            rows = rows + weight * f[:, k : k + n]
+        return rows
+
+    def __call__(self, x: Traj) -> Rows:
+        return self.rows_of(self.acting(x))
+
+    def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
+        level, c = self.acting, self.coefficients
+        slope, n = level.gradient(x), max(x.shape[1] - len(c) + 1, 0)
+
+        def pull(w: Rows) -> Traj:
+            spread = w.new_zeros(len(w), x.shape[1])
+            for k, weight in enumerate(c):
+                spread[:, k : k + n] += weight * w
+            return spread[..., None] * slope
+
+        size = level.size(x)
+        largest = size[:, :n]
+        for k in range(1, len(c)):
+            largest = torch.maximum(largest, size[:, k : k + n])
+        return self(x), pull, sum(abs(weight) for weight in c) ** 2 * largest
+
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Chain":
+        return self._each(lambda level: level.pull_back(centre, scale))
+
+    def take(self, which: Tensor) -> "Chain":
+        return self._each(lambda level: take(level, which))
+
+    def to(self, like: Tensor) -> "Chain":
+        return self._each(lambda level: moved(level, like))
+
+    def shift(self, margin: float) -> "Chain":
+        """g <= -margin is the same chain over h - margin / alpha, or / (alpha alpha2)."""
+        return self.shift_level(margin / sum(self.coefficients))
+
+    def shift_level(self, margin: float) -> "Chain":
+        return self._each(lambda level: level.shift(margin))
+
+    def _each(self, change: Callable[[Level], Level]) -> "Chain":
+        return replace(
+            self, level=change(self.level), ahead=None if self.ahead is None else change(self.ahead)
+        )
+
+    def segment_max(self, x: Traj) -> Rows:
+        """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
+        return Waypoints(self.name, self.level).segment_max(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return self.level(x)
+
+    def on_segments(self) -> "tuple[Part, ...]":
+        """The chain, and its barrier on the segments where the chain does not give it."""
+        if not self.level.convex:
+            return (self, _segments(self.name, self.level))
+        return (self,) if self.ahead is None else (self, Waypoints(self.name, self.level))

@@ -1,0 +1,78 @@
+"""Constraint rows of which nothing but the function is known."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from cdiff_cli.arrays import Pull, Rows, Traj
+from cdiff_cli.constraints.state_sets import take
+from cdiff_cli.constraints.trajectory import Part
+
+
+@dataclass(frozen=True)
+class Opaque:
+    """Rows of which only the function is known: differentiated by autograd, projected by sequential linearisation.
+
+    fn             trajectory in environment units -> rows, differentiable
+    count          number of rows at a horizon
+    centre, scale  of the trajectories it is applied to, where they are not in environment units: those are centre + scale * x
+    """
+
+    name: str
+    fn: Callable[[Traj], Rows]
+    count: Callable[[int], int]
+    margin: float = 0.0
+    centre: Tensor | None = None
+    scale: Tensor | None = None
+
+    trailing: ClassVar = {"centre": 1, "scale": 1}
+    spans = True
+    affine = False
+
+    def labels(self, horizon: int) -> list[str]:
+        return [f"{self.name}@{i}" for i in range(self.count(horizon))]
+
+    def __call__(self, x: Traj) -> Rows:
+        if self.centre is not None and self.scale is not None:
+            x = self.centre.to(x) + self.scale.to(x) * x
+        return self.fn(x) + self.margin
+
+    def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
+        with torch.enable_grad():
+            leaf = x.detach().clone().requires_grad_()
+            rows = self(leaf)
+
+            def pull(w: Rows) -> Traj:
+                return torch.autograd.grad(rows, leaf, w, retain_graph=True)[0]
+
+        size = pull(torch.ones_like(rows)).square().sum((1, 2))
+        return rows.detach(), pull, size[:, None].expand_as(rows)
+
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Opaque":
+        if self.centre is None or self.scale is None:
+            return replace(self, centre=centre, scale=scale)
+        return replace(self, centre=self.centre + self.scale * centre, scale=self.scale * scale)
+
+    def take(self, which: Tensor) -> "Opaque":
+        return take(self, which)
+
+    def to(self, like: Tensor) -> "Opaque":
+        return self
+
+    def shift(self, margin: float) -> "Opaque":
+        return replace(self, margin=self.margin + margin)
+
+    shift_level = shift
+
+    def segment_max(self, x: Traj) -> Rows:
+        return self(x)
+
+    def state_values(self, x: Traj) -> Rows:
+        return self(x).amax(1, keepdim=True).expand(x.shape[:2])
+
+    def on_segments(self) -> "tuple[Part, ...]":
+        """Nothing is known of it between the waypoints."""
+        return (self,)

@@ -1,0 +1,50 @@
+"""Coordinates whose values are given: the start, the goal."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cdiff_cli.arrays import Traj
+
+
+@dataclass(frozen=True)
+class Pins:
+    """Coordinates whose values are given: the start, the goal.
+
+    mask     True where fixed             [horizon, dim]
+    values   what they are fixed to       [batch, horizon, dim]
+    """
+
+    mask: Bool[Tensor, "horizon dim"]
+    values: Traj
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether each waypoint is fixed as a whole or not at all."""
+        return bool((self.mask.all(1) == self.held).all())
+
+    @cached_property
+    def held(self) -> Bool[Tensor, "horizon"]:  # noqa: F821
+        """Waypoints with a fixed coordinate."""
+        return self.mask.any(1)
+
+    @cached_property
+    def loose(self) -> tuple[int, int]:
+        """The first waypoint that is not held, and the one after the last."""
+        free = [tau for tau, held in enumerate(self.held.tolist()) if not held]
+        return (free[0], free[-1] + 1) if free else (0, 0)
+
+    @classmethod
+    def none(cls, like: Traj) -> "Pins":
+        return cls(torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device), like)
+
+    def paint(self, x: Traj) -> Traj:
+        """x with the pinned coordinates set."""
+        return torch.where(self.mask, self.values.to(x), x)
+
+    def free(self, direction: Traj) -> Traj:
+        """A direction that leaves the pinned coordinates alone."""
+        return torch.where(self.mask, 0.0, direction)

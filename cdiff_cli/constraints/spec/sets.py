@@ -1,0 +1,305 @@
+"""The constraint kinds over one level, linear and quadratic: their YAML, and how their numbers, given or observed, make a level."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, PlainSerializer, WithJsonSchema, WrapValidator, model_validator
+from torch import Tensor
+
+from cdiff_cli.constraints.observed import Observed, Seen, carried
+from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Level, Quadric
+from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.yaml_files import Strict
+
+Location = tuple[str | int, ...]
+Layout = Sequence[str]
+Number = Annotated[float, Field(strict=True)]
+PositiveNumber = Annotated[float, Field(strict=True, gt=0)]
+Coordinates = Annotated[dict[str, Number], Field(min_length=1)]
+Safety = Annotated[
+    Literal["waypoints", "segments"] | None,
+    Field(
+        description="where it must hold: at waypoints, or all along the straight segments between them; default: the preset's"
+    ),
+]
+_AS_IT_IS = PlainSerializer(lambda value: value, return_type=float | str)
+
+
+def _or_name(value: Any, number: Callable[[Any], float]) -> Any:
+    return value if isinstance(value, str) else number(value)
+
+
+def _schema(**number: Any) -> WithJsonSchema:
+    name = {"type": "string", "description": "name of an observed quantity, such as obstacle.x"}
+    return WithJsonSchema({"anyOf": [{"type": "number"} | number, name]})
+
+
+Quantity = Annotated[Number, WrapValidator(_or_name), _AS_IT_IS, _schema()]
+"""A number, or the name of an observed quantity: text, until it is observed."""
+PositiveQuantity = Annotated[
+    PositiveNumber, WrapValidator(_or_name), _AS_IT_IS, _schema(exclusiveMinimum=0)
+]
+Quantities = Annotated[dict[str, Quantity], Field(min_length=1)]
+Velocity = Annotated[
+    Quantities | None,
+    Field(
+        description="rate of change of each coordinate of the set, a second: how it moves on over the plan's waypoints"
+    ),
+]
+Hold = Annotated[
+    bool | None,
+    Field(description="true: the set is taken to stay where it is observed, whatever its velocity"),
+]
+NOTHING: Seen = {}
+
+
+class Linear(Strict):
+    """a.x <= b."""
+
+    kind: Literal["linear"]
+    name: str = ""
+    safety: Safety = None
+    a: Annotated[
+        Quantities,
+        Field(description="coefficient of each coordinate; coordinates left out count 0"),
+    ]
+    b: Annotated[Quantity, Field(description="bound, in the units of a.x")]
+    velocity: Velocity = None
+    hold: Hold = None
+
+    @model_validator(mode="after")
+    def _not_zero(self) -> "Linear":
+        if not any(self.a.values()):
+            raise ValueError(
+                "all coefficients are 0, so the constraint restricts nothing; give at least one that is not"
+            )
+        check_velocity(self.velocity, self)
+        return self
+
+    def coordinates(self) -> Iterator[tuple[Location, str]]:
+        yield from ((("a", name), name) for name in self.a)
+
+    def observes(self) -> Iterator[tuple[Location, str]]:
+        """Where the name of an observed quantity stands."""
+        yield from names_in({"a": self.a, "b": self.b, "velocity": self.velocity})
+
+    def level(self, layout: Layout, seen: Seen = NOTHING) -> Level:
+        return Affine(vector(self.a, layout, seen), _filled(self.b, seen))
+
+    def compile(self, layout: Layout) -> Part:
+        return observed_or_not(
+            self.name,
+            self,
+            self.velocity,
+            self.hold,
+            layout,
+            lambda at, _: Waypoints(self.name, at(0.0)),
+        )
+
+    def describe(self) -> str:
+        return f"{added(self.a)} <= {shown(self.b)}{moves(self.velocity, self.hold)}"
+
+
+class Quadratic(Strict):
+    """Inside or outside a ball (centre, radius), an ellipsoid (centre, semi_axes), or x.P x + q.x = r.
+
+    form distance: the signed distance to the ball's surface (for an ellipsoid a lower bound of it), metres.
+    form squared:  radius^2 - |x - centre|^2 and the like, square metres.
+    """
+
+    kind: Literal["quadratic"]
+    name: str = ""
+    safety: Safety = None
+    side: Literal["outside", "inside"]
+    centre: Quantities | None = None
+    radius: PositiveQuantity | None = None
+    semi_axes: Annotated[dict[str, PositiveQuantity], Field(min_length=1)] | None = None
+    P: Annotated[dict[str, Coordinates], Field(min_length=1)] | None = None
+    q: Quantities | None = None
+    r: Quantity | None = None
+    form: Literal["distance", "squared"] = "distance"
+    velocity: Velocity = None
+    hold: Hold = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> "Quadratic":
+        general = self.P is not None or self.q is not None or self.r is not None
+        round_ = self.centre is not None or self.radius is not None or self.semi_axes is not None
+        if general and round_:
+            raise ValueError(
+                "found both a centre and P, q, r; give either centre and radius (or semi_axes), or P, q, r"
+            )
+        if general and (self.P is None or self.r is None):
+            raise ValueError(
+                "P and r belong together (q is optional): x.P x + q.x <= r inside, >= r outside"
+            )
+        if not general and (
+            self.centre is None or (self.radius is None) == (self.semi_axes is None)
+        ):
+            raise ValueError("expected a centre and either a radius or semi_axes (or P, q, r)")
+        if self.semi_axes is not None and set(self.semi_axes) != set(self.centre or {}):
+            raise ValueError("semi_axes must name the same coordinates as centre")
+        if general and "form" in self.model_fields_set and self.form == "distance":
+            raise ValueError("P, q, r has no distance form; leave `form` out")
+        check_velocity(self.velocity, self)
+        return self
+
+    def coordinates(self) -> Iterator[tuple[Location, str]]:
+        for field in ("centre", "semi_axes", "P", "q"):
+            for name in getattr(self, field) or {}:
+                yield (field, name), name
+        for row, columns in (self.P or {}).items():
+            yield from ((("P", row, name), name) for name in columns)
+
+    def observes(self) -> Iterator[tuple[Location, str]]:
+        """Where the name of an observed quantity stands."""
+        yield from names_in(
+            {
+                field: getattr(self, field)
+                for field in ("centre", "radius", "semi_axes", "q", "r", "velocity")
+            }
+        )
+
+    def level(self, layout: Layout, seen: Seen = NOTHING) -> Level:
+        side = 1 if self.side == "outside" else -1
+        if self.P is not None:
+            assert self.r is not None
+            P = torch.stack([vector(self.P.get(row, {}), layout) for row in layout])
+            return Quadric(
+                -side * (P + P.T) / 2,
+                -side * vector(self.q or {}, layout, seen),
+                -side * _filled(self.r, seen),
+            )
+        assert self.centre is not None
+        names = [name for name in layout if name in self.centre]
+        lengths = {name: self.semi_axes[name] if self.semi_axes else self.radius for name in names}
+        axes, centre = vector(lengths, names, seen), vector(self.centre, names, seen)
+        which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
+        m = axes.amin(-1)
+        if self.form == "distance":
+            return Ellipsoid(which, centre, axes, m, side)
+        around = Quadric(
+            -side * which.T @ which, torch.zeros(len(layout), dtype=torch.float64), -side * m**2
+        )  # m^2 - |x|^2
+        to_ball = m[..., None] / axes
+        return around.pull_back(-(centre * to_ball) @ which, to_ball @ which + (1 - which.sum(0)))
+
+    def compile(self, layout: Layout) -> Part:
+        return observed_or_not(
+            self.name,
+            self,
+            self.velocity,
+            self.hold,
+            layout,
+            lambda at, _: Waypoints(self.name, at(0.0)),
+        )
+
+    def describe(self) -> str:
+        if self.P is not None:
+            square = " + ".join(
+                f"{v:g} {a} {b}" for a, row in self.P.items() for b, v in row.items()
+            )
+            linear = f" + {added(self.q)}" if self.q else ""
+            return f"{square}{linear} {'>=' if self.side == 'outside' else '<='} {shown(self.r)}{moves(self.velocity, self.hold)}"
+        centre = ", ".join(
+            f"{name} = {shown(value)}" for name, value in (self.centre or {}).items()
+        )
+        size = (
+            f"radius {shown(self.radius)}"
+            if self.radius
+            else "semi-axes " + added(self.semi_axes or {}).replace(" + ", ", ")
+        )
+        ball = f"{self.side} the {'ball' if self.radius else 'ellipsoid'} at {centre}, {size} ({self.form})"
+        return ball + moves(self.velocity, self.hold)
+
+
+def observed_or_not(
+    name: str,
+    shape: Linear | Quadratic,
+    velocity: Mapping[str, float | str] | None,
+    hold: bool | None,
+    layout: Layout,
+    part: Callable[[Callable[[float], Level], Layout], Part],
+) -> Part:
+    """part(at, layout), at(time) being the level of the shape `time` seconds further than each waypoint; where the shape has
+    observed quantities, the part that waits for them.
+    """
+    velocity = None if hold else velocity
+    own = [seen for location, seen in shape.observes() if location[0] != "velocity"]
+    names = tuple(dict.fromkeys((*own, *(seen for _, seen in names_in(velocity or {})))))
+    if not names:
+        return part(lambda _: shape.level(layout), layout)
+
+    def make(seen: Seen, dt: float, horizon: int) -> Part:
+        level = shape.level(layout, seen)
+        if velocity is None:
+            return part(lambda _: level, layout)
+        rate = vector(velocity, layout, seen)
+        return part(lambda time: carried(level, rate, dt, horizon, time), layout)
+
+    return Observed(name, names, make)
+
+
+def check_velocity(velocity: Mapping[str, float | str] | None, shape: Linear | Quadratic) -> None:
+    """Refuse a velocity of what does not move."""
+    if velocity is None:
+        return
+    own = dict.fromkeys(name for _, name in shape.coordinates())
+    foreign = [name for name in velocity if name not in own]
+    if foreign:
+        raise ValueError(
+            f'`velocity` moves "{foreign[0]}", on which the set does not depend; it has {", ".join(own)}'
+        )
+    if not any(location[0] != "velocity" for location, _ in shape.observes()):
+        raise ValueError(
+            "`velocity` says how an observed set moves on, and nothing here is observed; leave it out"
+        )
+
+
+def names_in(numbers: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
+    """The names of observed quantities among these numbers and tables of numbers, and where they stand."""
+    for field, value in numbers.items():
+        if isinstance(value, str):
+            yield (field,), value
+        elif isinstance(value, dict):
+            yield from (((field, *inner), name) for inner, name in names_in(value))
+
+
+def vector(values: Mapping[str, Any], layout: Layout, seen: Seen = NOTHING) -> Tensor:
+    """The numbers in the layout's order, 0 where there is none: [dim], or [batch, 1, dim] where some are observed."""
+    wanted = [values.get(name, 0.0) for name in layout]
+    if not any(isinstance(value, str) for value in wanted):
+        return torch.tensor(wanted, dtype=torch.float64)
+    numbers = [_filled(value, seen) for value in wanted]
+    shape = max((number.shape for number in numbers), key=len)
+    return torch.stack([number.expand(shape) for number in numbers], -1)
+
+
+def _filled(value: float | str, seen: Seen) -> Tensor:
+    """A number as a tensor, [] or, observed, [batch, 1]."""
+    return (
+        seen[value].double()[:, None]
+        if isinstance(value, str)
+        else torch.tensor(value, dtype=torch.float64)
+    )
+
+
+def added(values: Mapping[str, float | str]) -> str:
+    return " + ".join(f"{shown(value)} {name}" for name, value in values.items())
+
+
+def shown(value: float | str | None) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def moves(velocity: Mapping[str, float | str] | None, hold: bool | None) -> str:
+    """', moving by ...' or nothing."""
+    if velocity is None:
+        return ""
+    return (
+        ", held where it is observed"
+        if hold
+        else f", moving on at {added(velocity).replace(' + ', ', ')} a second"
+    )

@@ -1,0 +1,220 @@
+"""Recipes and cards: how a task's model is trained and sampled, and what a trained checkpoint says of itself."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from cdiff_cli.paths import home, shown
+from cdiff_cli.yaml_files import Strict, load
+
+Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class NetworkSpec(Strict):
+    """Size of the TemporalUnet (networks.py); the defaults are Diffuser's architecture."""
+
+    kind: Literal["unet"] = "unet"
+    width: Annotated[int, Field(gt=0, multiple_of=8)] = (
+        32  # the channels are normalised in 8 groups
+    )
+    multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
+    patch: Literal[1, 2, 4, 8, 16] = 1
+    octaves: Annotated[int, Field(ge=0, le=10)] = 0
+    conditions: Count = 0
+
+    @property
+    def stride(self) -> int:
+        """What the horizon must divide by."""
+        return self.patch * 2 ** (len(self.multipliers) - 1)
+
+
+class MlpSpec(Strict):
+    """Size of the ResidualMlp (networks.py), for the short windows of control."""
+
+    kind: Literal["mlp"]
+    width: Positive = 256
+    depth: Positive = 3
+    conditions: Count = 0
+
+    @property
+    def stride(self) -> int:
+        return 1
+
+
+class InverseSpec(Strict):
+    """How the inverse dynamics model is trained.
+
+    ahead   waypoints between the two states it is asked about: 1, or more where one input hardly moves the state
+    """
+
+    width: Positive = 256
+    steps: Positive = 6000
+    batch: Positive = 512
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    ahead: Positive = 1
+
+
+class ReturnSpec(Strict):
+    """How windows are labelled by what is earned from their first state on (return_labels.py).
+
+    discount   of a reward one step later; of the walk, 1 / (1 - discount) steps must be left for a label
+    """
+
+    discount: Annotated[float, Field(gt=0, lt=1)] = 0.99
+
+
+class TrainSpec(Strict):
+    """One way to train; the defaults are those of the small recipe.
+
+    begin     the recipe whose checkpoint is trained on, None: from the beginning
+    returns   condition the planner on the return, for Recipe.returns to ask for the most; None: it knows of none
+    dropout   of planners conditioned on constraints or the return, share of the windows shown without their label
+    """
+
+    network: NetworkSpec | MlpSpec = NetworkSpec()
+    steps: Positive
+    batch: Positive = 32
+    accumulate: Positive = 1
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    schedule: str = Field("cosine", pattern="^(cosine|constant)$")
+    ema: Annotated[float, Field(ge=0, lt=1)] = 0.995
+    smoothness: Annotated[float, Field(ge=0)] = 100.0
+    emphasis: Annotated[float, Field(ge=1)] = 5.0
+    trips: Annotated[float, Field(ge=0, le=1)] = 0.5
+    clip: Annotated[float, Field(gt=0)] | None = 1.0
+    bf16: bool = True
+    begin: str | None = None
+    returns: ReturnSpec | None = None
+    dropout: Annotated[float, Field(gt=0, lt=1)] = 0.25
+    inverse: InverseSpec | None = None
+
+
+class DemonstrationSpec(Strict):
+    """The task's own demonstrations."""
+
+    steps: Positive = 1_000_000
+    seed: int = 0
+
+
+class PaperUnits(Strict):
+    """The paper's own definitions where they differ: its violation is ours times `violation`, its distance sums
+    (distance to the mean unconstrained plan) ** distance_power."""
+
+    violation: float = 1.0
+    distance_power: float = 1.0
+
+
+class Preset(Strict):
+    """How to sample.
+
+    steps       network calls to respace the schedule to; None: as trained
+    extra_steps further steps with t frozen and no noise; extra_steps_of: the number of a method that has its own
+    polish      project the finished plans once more, in float64
+    safety      where constraints hold that do not say so themselves
+    dynamics    obey the checkpoint's linear dynamics too
+    temperature factor on all noise
+    resume      in control, begin each plan from the multipliers that the last one ended with
+    margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
+    methods     each method's constants by its name
+    """
+
+    kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
+    steps: Positive | None = None
+    extra_steps: Count = 0
+    extra_steps_of: dict[str, Count] = {}
+    polish: bool = False
+    safety: Literal["waypoints", "segments"] = "waypoints"
+    dynamics: bool = False
+    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
+    resume: bool = False
+    margin: bool = False
+    methods: dict[str, dict[str, Any]] = {}
+
+    def extra_steps_for(self, method: str) -> int:
+        return self.extra_steps_of.get(method, self.extra_steps)
+
+
+class Recipe(Strict):
+    """models/<task>/recipe.yaml
+
+    frame     limits: the data's limits to [-1, 1]; relative: windows relative to their first state (normaliser.py), for control
+    returns   weight of guidance towards the highest return, the same for all methods and presets, where the checkpoint is
+              conditioned on it: 0 asks for none, 1 is the conditioned estimate itself, others take two network calls a step
+    """
+
+    task: str
+    horizon: Positive
+    n_steps: Positive
+    frame: Literal["limits", "relative"] = "limits"
+    start: dict[str, float] | None = None
+    goal: dict[str, float] | None = None
+    constraints: str
+    demonstrations: DemonstrationSpec = DemonstrationSpec()
+    train: dict[str, TrainSpec] = {}
+    returns: Annotated[float, Field(ge=0)] = 0.0
+    presets: dict[str, Preset]
+    paper_units: PaperUnits = PaperUnits()
+
+    @model_validator(mode="after")
+    def _horizon_divides(self) -> "Recipe":
+        for name, spec in self.train.items():
+            stride = spec.network.stride
+            if self.horizon % stride:
+                raise ValueError(
+                    f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride"
+                )
+            if spec.returns and self.frame != "relative":
+                raise ValueError(
+                    f"train.{name}.returns: for control tasks (frame: relative), whole plans earn nothing; leave it out"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _presets_fit(self) -> "Recipe":
+        for name, preset in self.presets.items():
+            if preset.steps is not None and preset.steps > self.n_steps:
+                raise ValueError(
+                    f"presets.{name}.steps: expected 1 to {self.n_steps} (n_steps), found {preset.steps}"
+                )
+        return self
+
+
+class Card(Strict):
+    """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
+
+    inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
+    constraints   hash of the constraints that a conditional planner was trained for; None of the others
+    observed      quantities that it is told, besides
+    returns  of a planner conditioned on the return: the discount, the reward a step that is told as -1 and as 1, the share of the
+             states with a label; None of the others
+    linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
+    """
+
+    task: str
+    recipe: str
+    horizon: int
+    n_steps: int
+    network: NetworkSpec | MlpSpec
+    parameters: int
+    steps: int
+    seed: int
+    loss: float
+    mse: float
+    dataset: str
+    data_sha256: str
+    weights_sha256: str
+    commit: str
+    device: str
+    threads: int
+    wall_s: float
+    data: dict[str, float]
+    linear: float | None = None
+    inverse: dict[str, float] | None = None
+    constraints: str | None = None
+    observed: tuple[str, ...] = ()
+    returns: dict[str, float] | None = None
+
+
+def load_recipe(task: str) -> Recipe:
+    return load(shown(home() / "models" / task / "recipe.yaml"), Recipe)

@@ -1,0 +1,127 @@
+"""The nearest trajectory on a control-barrier chain, exactly: the values of the barrier h are projected onto
+
+    h_{k+1} >= gamma h_k                                                  plain: weighted isotonic regression
+    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0            high-order: a small quadratic program
+
+with the weights that a waypoint's way to another value of h has, then each waypoint moves to its new level set. Half-spaces have
+planes for level sets and balls spheres, so that the nearest point is along the normal and the result is the nearest trajectory.
+"""
+
+import torch
+from torch import Tensor
+
+from cdiff_cli.arrays import Rows, Traj, times
+from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.hocbf import Approach
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
+from cdiff_cli.projection.solvers.isotonic import _nearest_between, _powers
+from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
+
+LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
+NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
+
+
+def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
+    """The nearest trajectory to z with g <= 0; waypoints are pinned as a whole or not at all."""
+    level = chain.acting
+    if isinstance(level, Approach):
+        return _by_linearising(chain, level, z, pins)
+    if isinstance(level, Affine):
+        h, unit = -level(z), -level.a
+        way = level.a.square().sum(-1).clamp_min(1e-30).rsqrt()
+        low = None
+        unit = unit * way[..., None]
+    else:
+        assert isinstance(level, Ellipsoid)
+        y = level.scaled(z)
+        y[..., 0] += NUDGE
+        length = y.norm(dim=-1)
+        h, way, low = level.m * (length - 1), level.axes[..., 0] / level.m, -level.m
+    if not bool((chain.rows_of(-h) > 0).any()):
+        return z
+    target = _nearest_values(chain, h, way.square().expand(*way.shape[:-1], h.shape[1]), low, pins)
+    step = (target - h) * way
+    if isinstance(level, Ellipsoid):
+        return z + times((step / length)[..., None] * y, level.which)
+    return z + step[..., None] * unit
+
+
+def _by_linearising(chain: Chain, level: Approach, z: Traj, pins: Pins) -> Traj:
+    """A nearest trajectory to z, by the exact projection onto the chain of the barriers linearised where the last one ended: each
+    moves its waypoint along its gradient there. A local solution; what it ends on satisfies the chain to rounding.
+    """
+    x = z
+    for _ in range(LINEARISED):
+        h = -level(x)
+        if not bool((chain.rows_of(-h) > 0).any()) and x is not z:
+            break
+        slope = -level.gradient(x)
+        size = slope.square().sum(-1).clamp_min(1e-30)
+        there = h + (slope * (z - x)).sum(-1)
+        target = _nearest_values(chain, there, 1 / size, None, pins)
+        x = z + ((target - there) / size)[..., None] * slope
+    return x
+
+
+def _nearest_values(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins) -> Rows:
+    """The nearest values to h that the chain allows, those of held waypoints kept; none below `low`, which has the dimensions of
+    a number of the level: h at the centre of a ball.
+    """
+    first, last = pins.loose
+    if chain.alpha2 is not None:
+        return _nearest_under(chain, h, weight, low, first, last)
+    gamma = 1 - chain.alpha
+    target = _nearest_between(h, gamma, weight, first, last)
+    by_waypoint = low is not None and low.ndim > 0 and low.shape[-1] > 1
+    if low is not None and (first == 0 or by_waypoint):
+        return torch.where(pins.held, target, torch.maximum(target, _lowest_chain(low, gamma, h)))
+    return target
+
+
+def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
+    """The lowest chain whose values are nowhere below `low` [], [horizon | 1] or [batch | 1, horizon | 1]: v_k = max over i <= k of
+    gamma^(k - i) low_i. A bound on the first index, which the chain hands on, exact where the balls are all of one size.
+    """
+    power = _powers(gamma, h.shape[1] - 1, h)
+    if low.ndim == 0 or low.shape[-1] == 1:
+        return power * low
+    index = torch.arange(h.shape[1], device=h.device)
+    past = index - index[:, None]
+    return torch.where(past >= 0, power[past.clamp_min(0)] * low[..., None], -torch.inf).amax(-2)
+
+
+# high-order chains ----------------------------------------------------------------------------------------------------
+
+
+def _nearest_under(
+    chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int
+) -> Rows:
+    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_dual). Where that asks for
+    less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.
+    """
+    one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
+    D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)
+    v[:, free] += _by_dual(D[:, free], v @ D.T, 1 / weight.double()[..., free])
+    if low is not None and bool((v < low).any()):
+        order = len(chain.coefficients) - 1
+        v = torch.maximum(v, low)
+        for k in range(max(first, order), last):
+            due = sum(
+                (
+                    -weight * v[:, k - order + at]
+                    for at, weight in enumerate(chain.coefficients[:-1])
+                ),
+                torch.zeros_like(v[:, 0]),
+            )
+            v[:, k] = torch.maximum(v[:, k], due)
+    return v.to(h)
+
+
+def _by_dual(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
+    """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0 [batch, n], for D [r, n], b [batch, r], way [n] or [batch, n], by its dual:
+
+    d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
+    """
+    Q = (D * way[..., None, :]) @ D.T
+    return (nonnegative_least(Q, -b, 1e-12 * (1 + b.abs().amax(1, keepdim=True))) @ D) * way

@@ -1,0 +1,92 @@
+"""Diffusion: schedule, reverse kernels, training loss, and the only loop over the diffusion steps t."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+
+from cdiff_cli.arrays import Traj
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.models.denoiser import Denoiser
+from cdiff_cli.models.schedule import Schedule
+from cdiff_cli.sampling.kernels import Kernel, Previous, ddpm
+
+
+@dataclass(frozen=True)
+class Step:
+    """One reverse step as a method sees it: what is known, and the one way on.
+
+    x, x0     x_t and its clean estimate, pins painted, normalised   [batch, horizon, dim]
+    beta      beta_t
+    level     sqrt(alpha_bar_{t-1}), the share of the clean trajectory in x_{t-1}
+    reverse   clean estimate -> x_{t-1}; noise z and pins already bound; the next step's kernel knows the last estimate given
+    last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
+    left      denoising steps still to come: 0 in the last and in the frozen ones
+    """
+
+    x: Traj
+    x0: Traj
+    beta: float
+    level: float
+    reverse: Callable[[Traj], Traj]
+    pins: Pins
+    last: bool
+    left: int = 0
+
+
+class Method(Protocol):
+    """A way to obey g <= 0 while sampling: hyper-parameters only, its state is passed in and returned."""
+
+    def init(self, x: Traj, g: Constraint) -> Any: ...
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]: ...
+
+
+def sample(
+    denoiser: Denoiser,
+    schedule: Schedule,
+    method: Method,
+    g: Constraint,
+    pins: Pins,
+    noise: Callable[[], Traj],
+    *,
+    kernel: Kernel = ddpm,
+    extra_steps: int = 0,
+    first: Traj | None = None,
+    on_step: Callable[[int, Step, Traj], None] | None = None,
+) -> Traj:
+    """Plans x_0 in normalised coordinates [batch, horizon, dim].
+
+    first        x_T, the schedule's noisiest; drawn where None
+    extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
+    on_step      called with the number of network calls so far, the step and x_{t-1}
+    """
+    x = pins.paint(noise() if first is None else first)
+    state = method.init(x, g)
+    used: Previous | None = None
+    for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):
+        x0 = pins.paint(denoiser(x, schedule.t[i]))
+        last = i == 1
+        z = torch.zeros_like(x) if last else noise()
+        a, b = schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
+        here = x
+
+        def reverse(
+            clean: Traj,
+            x: Traj = here,
+            z: Traj = z,
+            a: float = a,
+            b: float = b,
+            previous: Previous | None = used,
+        ) -> Traj:
+            nonlocal used
+            used = clean, a
+            return pins.paint(kernel(x, clean, z, a, b, previous))
+
+        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last, i - 1)
+        x, state = method.step(step, g, state)
+        if on_step:
+            on_step(call, step, x)
+    return x

@@ -1,0 +1,117 @@
+"""Time a diffusion step of each method of Table 1, beside the paper's, in one run.
+
+    python tests/benchmarks/speed/table1_times.py [--task maze2d-umaze] [--n 10] [--steps 16] [--repeats 3] [--variants ros,res,tvs]
+
+The methods take turns within each repeat, so their ratios to diffuser hold when the machine's speed drifts. Medians of the repeats,
+after one warm-up of all but ProxQP, which solves a QP a waypoint. A step is a diffusion step: of `conditional` that is one network
+call for twice as many plans. Respaced schedules change the number of steps, not what one costs: `recommended` obeys dynamics in
+the last sixteenth of them, `recommended*` (--no-dynamics) in none. The projection of the finished plan is left out.
+"""
+
+import argparse
+import itertools
+import statistics
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.evaluation import tables
+from cdiff_cli.paths import home
+from cdiff_cli.planning.open_loop import plan
+
+METHODS = (
+    "diffuser",
+    "guidance",
+    "conditional",
+    "terminal",
+    "final-projection",
+    "projected",
+    "primal-dual",
+    "alm",
+)
+OURS = ("projected", "primal-dual", "alm")
+Key = tuple[str, str]
+"""Method, with its variant, and preset."""
+
+
+def asked(arguments: argparse.Namespace) -> dict[Key, Resolved]:
+    """What is timed."""
+    common = {
+        "task": arguments.task,
+        "constraints": arguments.constraints,
+        "n": arguments.n,
+        "steps": arguments.steps,
+    }
+    runs = {
+        (method, "paper"): Options(method=method, preset="paper", **common) for method in METHODS
+    }
+    for variant, solver in itertools.product(
+        arguments.variants.split(","), ("closed-form", "proxqp")
+    ):
+        settings = (f"variant={variant}", f"solver={solver}")
+        runs[f"safediffuser {variant}, {solver}", "paper"] = Options(
+            method="safediffuser", preset="paper", settings=settings, **common
+        )
+    for preset, method in itertools.product(("recommended", "recommended*"), OURS):
+        runs[method, preset] = Options(method=method, no_dynamics=preset.endswith("*"), **common)
+    return {key: resolve(options) for key, options in runs.items()}
+
+
+def step_ms(one: Resolved) -> tuple[float, float]:
+    """Milliseconds of a diffusion step and, of these, in the network."""
+    problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
+    plans = plan(problem, one.method, one.seeds, kernel=one.kernel)
+    return 1e3 * plans.total_s / plans.calls, 1e3 * plans.network_s / plans.calls
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", default="maze2d-umaze")
+    parser.add_argument("--constraints", type=Path)
+    parser.add_argument("--n", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=16)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--variants", default="ros", help="of SafeDiffuser, separated by commas")
+    arguments = parser.parse_args()
+    runs = asked(arguments)
+    times: dict[Key, list[tuple[float, float]]] = {key: [] for key in runs}
+    for repeat in range(arguments.repeats + 1):
+        for key, one in runs.items():
+            if repeat or "proxqp" not in key[0]:
+                measured = step_ms(one)
+                if repeat:
+                    times[key].append(measured)
+    paper = {
+        method: float(values["step_ms"])
+        for (task, method), values in tables.read_paper(
+            home() / "runs" / "reference" / "paper.csv"
+        ).items()
+        if task == arguments.task
+    }
+    base = statistics.median(total for total, _ in times["diffuser", "paper"])
+    print(
+        f"{arguments.task}, batch {arguments.n}, {arguments.steps} steps, median of {arguments.repeats}, "
+        f"{torch.get_num_threads()} threads\n"
+    )
+    print(
+        "| method | preset | step / ms | network | over its network | of diffuser | paper: s | paper: of Diffuser |"
+    )
+    print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for (name, preset), measured in times.items():
+        total, network = (statistics.median(column) for column in zip(*measured, strict=True))
+        method = name.partition(" ")[0]
+        theirs = (
+            (f"{paper[method] / 1e3:.4f}", f"{paper[method] / paper['diffuser']:.2f}")
+            if method in paper
+            else ("", "")
+        )
+        ratios = f"{total / network:.2f} | {total / base:.2f}"
+        print(
+            f"| {name} | {preset} | {total:.2f} | {network:.2f} | {ratios} | {theirs[0]} | {theirs[1]} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

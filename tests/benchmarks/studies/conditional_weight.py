@@ -1,0 +1,118 @@
+"""The guidance weight of `conditional`: what each leaves of the violation and what it costs, on seeds that no table reports.
+
+    python tests/benchmarks/studies/conditional_weight.py --task swimmer [--constraints FILE] [--weights 1,2,4,8] [--n 20] [--seed 1000]
+
+Preset `paper`, `diffuser` for comparison. Mazes: plans between the paper's start and goal. Control tasks: episodes, on the ball
+run past a ghost. Chosen is the weight that leaves the least violation, of those that cost at most a tenth: of the return, or of the
+plans (torn or in a wall).
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from acting import act
+
+from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.commands.rollout import controller
+from cdiff_cli.evaluation import metrics
+from cdiff_cli.planning.open_loop import plan
+from cdiff_cli.sampling.methods import Unconstrained
+
+WHOLE = ("weight", "violation / g", "of diffuser", "worst / g", "distance / m", "torn", "in wall")
+CONTROL = (
+    "weight",
+    "return",
+    "violation rate / %",
+    "executed violation / g",
+    "worst / g",
+    "episodes violating",
+    "fell",
+)
+
+
+def told(values: np.ndarray) -> str:
+    """Mean and standard error."""
+    return f"{values.mean():.4g} ± {values.std(ddof=1) / len(values) ** 0.5:.2g}"
+
+
+def planned(one: Resolved) -> list[str]:
+    """Cells of whole plans."""
+    problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
+    plans, free = (
+        plan(problem, one.method, one.seeds),
+        plan(one.problem, Unconstrained(), one.seeds),
+    )
+    g, checkpoint = problem.g, one.checkpoint
+    assert checkpoint is not None
+    rows = metrics.plan_metrics(problem.task, g, plans.x, free.x, one.recipe.paper_units)
+    violation, unbound = (metrics.violation(g, each.x) for each in (plans, free))
+    torn = np.mean(
+        [not metrics.smooth(row["jump"], checkpoint.card.data["jump_q999"]) for row in rows]
+    )
+    wall, worst = np.mean([row["wall"] for row in rows]), max(row["worst_waypoint"] for row in rows)
+    distance = np.array([row["distance"] for row in rows])
+    return [
+        told(violation),
+        f"{violation.sum() / unbound.sum():.3f}",
+        f"{worst:.3f}",
+        told(distance),
+        f"{torn:.2f}",
+        f"{wall:.2f}",
+    ]
+
+
+def acted(one: Resolved) -> list[str]:
+    """Cells of episodes."""
+    env = {"collide": False} if one.options.task == "ball-run" else {}
+    found = act(controller(one), one.seeds, one.problem.g, env)
+    rate, over = (
+        np.array([row[name] for row in found.rows])
+        for name in ("violation_rate", "executed_violation")
+    )
+    return [
+        found.returned(),
+        told(rate),
+        told(over),
+        found.worst(),
+        found.violating(),
+        f"{found.mean('fell'):.2f}",
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", default="maze2d-umaze")
+    parser.add_argument("--constraints", type=Path)
+    parser.add_argument("--weights", default="1,2,4,8")
+    parser.add_argument("--n", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1000)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    common = {
+        "task": asked.task,
+        "constraints": asked.constraints,
+        "preset": "paper",
+        "n": asked.n,
+        "seed": asked.seed,
+    }
+    runs = {"diffuser": Options(method="diffuser", **common)}
+    for weight in asked.weights.split(","):
+        runs[weight] = Options(method="conditional", settings=(f"weight={weight}",), **common)
+    acts = resolve(runs["diffuser"]).acts
+    stem = resolve(runs["diffuser"]).constraints_path.stem
+    print(
+        f"{asked.task}, {stem}, preset paper, n = {asked.n}, seeds {asked.seed}-{asked.seed + asked.n - 1}\n"
+    )
+    heading = CONTROL if acts else WHOLE
+    print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")
+    for name, options in runs.items():
+        print(
+            f"| {' | '.join([name, *(acted if acts else planned)(resolve(options))])} |", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()

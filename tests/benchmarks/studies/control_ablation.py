@@ -1,0 +1,107 @@
+"""What each choice of the ball run's recommended preset is worth: one row a change, the same episodes and noise for all.
+
+    python tests/benchmarks/studies/control_ablation.py [--episodes 60] [--seed 0]
+
+A ghost obstacle in all six patterns. Violations are executed states within 1.2 m of the obstacle's centre.
+"""
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import yaml
+from acting import act
+from rich.console import Console
+from rich.table import Table
+
+from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.rollout import controller
+from cdiff_cli.paths import home
+
+RATE = {"time": 0.2, "velocity": {"x": "vx", "y": "vy"}}
+PLACE = RATE | {"form": "place"}
+ROWS = [
+    ("diffuser, no constraint", "diffuser", {}, ()),
+    ("recommended alm", "alm", {}, ()),
+    ("g at the noisy sample", "alm", {}, ("on=noisy",)),
+    ("clean estimate changed", "alm", {}, ("on=clean", "rho=0.5", "c=1.2")),
+    ("projected", "projected", {}, ()),
+    ("primal-dual", "primal-dual", {}, ()),
+    ("obstacle held in place", "alm", {"hold": True}, ()),
+    ("plain barrier h", "alm", {"look_ahead": None}, ()),
+    ("plain barrier, squared form", "alm", {"look_ahead": None, "form": "squared"}, ()),
+    ("look-ahead to the place", "alm", {"look_ahead": PLACE}, ()),
+    ("order 2 in positions", "alm", {"look_ahead": None, "order": 2}, ()),
+    ("look-ahead 0.1 s", "alm", {"look_ahead": RATE | {"time": 0.1}}, ()),
+    ("look-ahead 0.4 s", "alm", {"look_ahead": RATE | {"time": 0.4}}, ()),
+    *((f"alpha {alpha:g}", "alm", {"alpha": alpha}, ()) for alpha in (0.1, 0.3, 0.85, 1.0)),
+    *((f"rho {rho:g}", "alm", {}, (f"rho={rho}",)) for rho in (1.0, 3.0, 30.0)),
+]
+
+
+def varied(change: dict, folder: Path) -> Path:
+    """The shipped constraint file with its one barrier changed."""
+    content = yaml.safe_load((home() / "constraints" / "ball-run.yaml").read_text())
+    (barrier,) = content["constraints"]
+    for key, value in change.items():
+        if key == "form":
+            barrier["barrier"]["form"] = value
+        elif value is None:
+            barrier.pop(key)
+        else:
+            barrier[key] = value
+    path = folder / "ball-run.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds = range(asked.seed, asked.seed + asked.episodes)
+    table = Table(
+        title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}"
+    )
+    for title in (
+        "change",
+        "return",
+        "violation rate / %",
+        "episodes violating",
+        "worst / m",
+        "saturation / %",
+    ):
+        table.add_column(title, justify="left" if title == "change" else "right")
+    truth = resolve(Options(task="ball-run")).problem.g
+    for name, method, change, settings in ROWS:
+        with tempfile.TemporaryDirectory() as folder:
+            path = varied(change, Path(folder))
+            acting = controller(
+                resolve(
+                    Options(
+                        task="ball-run",
+                        method=method,
+                        constraints=path,
+                        settings=settings,
+                        margin=0.0,
+                    )
+                )
+            )
+        found = act(
+            replace(acting, polish=False) if "squared" in name else acting,
+            seeds,
+            truth,
+            {"collide": False},
+        )
+        rate, saturation = f"{found.mean('violation_rate'):.3f}", f"{found.mean('saturation'):.1f}"
+        table.add_row(name, found.returned(), rate, found.violating(), found.worst(), saturation)
+        Console(stderr=True).print(name, found.returned())
+    Console(width=130).print(table)
+
+
+if __name__ == "__main__":
+    main()

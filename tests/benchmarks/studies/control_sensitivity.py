@@ -1,0 +1,196 @@
+"""What alpha, disturbed inputs and longer execution of a plan do to a locomotion task under its constraint.
+
+    python tests/benchmarks/studies/control_sensitivity.py --task hopper [--episodes 10] [--seed 100] [--only execute] [--keep]
+        [--picture docs/alpha-hopper.png]
+
+Recommended alm throughout, each row with margins of its own: those shipped where they fit, else calibrated here as `cdiff rollout
+--calibrate` does, on 100 episodes a pass from seed 5000 at level 0.99, and with --keep written beside the checkpoint. The picture
+shows h = limit - |w| for each alpha: along the first episode, and the median of a stride's nearest approach to the limit, over all
+strides and episodes, from the last step above 2.2 rad/s on; dotted, the fastest fall that the barrier allows, to its margin.
+"""
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import numpy as np
+import torch
+import yaml
+from acting import act
+from matplotlib import pyplot as plt
+from rich.console import Console
+from rich.table import Table
+
+from cdiff_cli.commands.calibrate import fit_margins
+from cdiff_cli.commands.margins import Chosen, write_calibration
+from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.commands.rollout import controller
+from cdiff_cli.evaluation.conformal import tightened
+from cdiff_cli.paths import home
+
+ALPHAS = (0.1, 0.3, 0.5, 0.85, 1.0)
+FROM = 2.2  # rad/s: where an approach begins
+STRIDE, APPROACH = 36, 14  # steps: half a stride of Hopper, at most; of an approach
+SETTLED = 500  # step after which every stride is like the last
+
+
+def changed(task: str, alpha: float | None = None, **options: Any) -> Options:
+    """The recommended alm with other options, its barriers at another alpha."""
+    path = home() / "constraints" / f"{task}.yaml"
+    if alpha is None:
+        return Options(task=task, **options)
+    content = yaml.safe_load(path.read_text())
+    for barrier in content["constraints"]:
+        barrier["alpha"] = alpha
+    other = Path(tempfile.mkdtemp()) / path.name
+    other.write_text(yaml.safe_dump(content))
+    return Options(task=task, constraints=other, **options)
+
+
+def fitted(options: Options, keep: bool) -> Resolved:
+    """The problem with margins that were calibrated on it."""
+    resolved = resolve(options)
+    if resolved.margins.match in ("exact", "unused"):
+        return resolved
+    calibrating = resolve(replace(options, calibrate=True, n=100, seed=5000))
+    found = fit_margins(calibrating, lambda *_: None, 0.99)
+    if keep:
+        write_calibration(calibrating.checkpoint.path, found)
+    margins = {name: each.margin for name, each in found.margins.items()}
+    problem = replace(resolved.problem, enforced=tightened(calibrating.problem.enforced, margins))
+    return replace(resolved, problem=problem, margins=Chosen(margins, "exact", found))
+
+
+def approaches(h: Any) -> list[tuple[int, int]]:
+    """(episode, the last step at FROM or above) before each smallest h of a stride [n, steps + 1]."""
+    found = []
+    for i, row in enumerate(h):
+        for k in range(3 * STRIDE, len(row) - 3 * STRIDE):
+            if row[k] == row[k - STRIDE : k + STRIDE + 1].min():
+                above = np.flatnonzero(row[k - STRIDE : k] >= FROM)
+                found += [(i, k - STRIDE + int(above[-1]))] if len(above) else []
+    return found
+
+
+def draw(
+    axes: Any, name: str, h: Any, alpha: float | None, margin: float, dt: float, colour: Any
+) -> None:
+    """h of one alpha, None: no constraint."""
+    found = approaches(h)
+    if not found:
+        return
+    episode, begin = next((each for each in found if each[1] >= SETTLED), found[-1])
+    shown = np.arange(-2 * STRIDE, STRIDE)
+    axes[0].plot(dt * shown, h[episode, begin + shown], label=name, lw=1.2, color=colour)
+    steps = np.arange(APPROACH + 1)
+    together = np.array([h[i, k + steps] for i, k in found])
+    middle = np.median(together, 0)
+    axes[1].plot(dt * steps, middle, lw=1.6, color=colour)
+    axes[1].fill_between(
+        dt * steps, *np.quantile(together, (0.1, 0.9), axis=0), color=colour, alpha=0.15, lw=0
+    )
+    if alpha is not None and alpha < 1:
+        axes[1].plot(
+            dt * steps,
+            margin + (middle[0] - margin) * (1 - alpha) ** steps,
+            ":",
+            lw=1,
+            color=colour,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--task", default="hopper")
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--only", default="", help="rows whose name begins so")
+    parser.add_argument("--keep", action="store_true")
+    parser.add_argument("--picture", type=Path)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    seeds = range(asked.seed, asked.seed + asked.episodes)
+    rows = [("alpha: no constraint", changed(asked.task, method="diffuser"))]
+    rows += [
+        (f"alpha {alpha:g}", changed(asked.task, None if alpha == 0.85 else alpha))
+        for alpha in ALPHAS
+    ]
+    rows += [
+        (f"action noise {noise:g}", changed(asked.task, action_noise=noise))
+        for noise in (0.02, 0.1, 0.25)
+    ]
+    rows += [(f"execute {k}", changed(asked.task, execute=k)) for k in (2, 4, 8)]
+    rows += [
+        ("warm 0.3, ddim", changed(asked.task, warm=0.3, kernel="ddim")),
+        ("warm 0.3", changed(asked.task, warm=0.3)),
+    ]
+    table = Table(
+        title=f"{asked.task}, recommended alm, {asked.episodes} episodes from seed {asked.seed}"
+    )
+    titles = (
+        "change",
+        "margins",
+        "return",
+        "violation rate / %",
+        "sum / rad/s",
+        "worst / rad/s",
+        "largest fall of h",
+        "fell",
+    )
+    for title in titles:
+        table.add_column(title, justify="left" if title == "change" else "right")
+    figure, axes = plt.subplots(
+        1, 2, figsize=(10, 3.7), sharey=True, width_ratios=(3, 2), layout="constrained"
+    )
+    colours = iter(["0.6", *plt.get_cmap("viridis")(np.linspace(0, 0.9, len(ALPHAS)))])
+    for name, options in rows:
+        if not name.startswith(asked.only):
+            continue
+        resolved = fitted(options, asked.keep)
+        acting = controller(resolved)
+        found = act(acting, seeds, acting.g)
+        h = -found.levels.max(-1)
+        fall = np.nanmax((h[:, :-1] - h[:, 1:]) / np.maximum(h[:, :-1], 0.05))
+        rate, total = (
+            f"{found.mean('violation_rate'):.3f}",
+            f"{found.mean('executed_violation'):.3f}",
+        )
+        margins = ", ".join(f"{margin:.2f}" for margin in resolved.margins.margins.values())
+        table.add_row(
+            name,
+            margins,
+            found.returned(),
+            rate,
+            total,
+            found.worst(),
+            f"{fall:.2f}",
+            f"{found.done.fell.sum()}",
+        )
+        if name.startswith("alpha"):
+            alpha = None if resolved.options.method == "diffuser" else float(name.split()[1])
+            margin = max(resolved.margins.margins.values(), default=0.0)
+            draw(
+                axes, name.removeprefix("alpha: "), h, alpha, margin, acting.task.dt, next(colours)
+            )
+        Console(stderr=True).print(name, margins, found.returned(), rate, found.worst())
+    Console(width=130).print(table)
+    if asked.picture:
+        for axis in axes:
+            axis.axhline(0, color="#d1495b", lw=1.2)
+            axis.set(xlabel="time / s")
+        axes[0].set(
+            ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit"
+        )
+        axes[1].set(title="approaches: median, 80 %; dotted: bound")
+        figure.legend(fontsize=8, frameon=False, ncols=6, loc="outside upper center")
+        figure.savefig(asked.picture, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Which inverse dynamics drive the ball: the network between states 1, 2, 4 or 8 waypoints apart, or the linear fit solved for u.
+
+    python tests/benchmarks/studies/inverse_dynamics.py [--episodes 60] [--seed 0]
+
+Ghost obstacle, all patterns; diffuser and recommended alm. The demonstrations are generated where they are not there yet.
+"""
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+import torch
+from acting import act
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.rollout import controller
+from cdiff_cli.models.recipe import InverseSpec
+from cdiff_cli.planning.receding_horizon import Controller
+from cdiff_cli.training.demonstrations import demonstrations, load_inputs
+from cdiff_cli.training.fit import fit_dynamics
+from cdiff_cli.training.inverse_dynamics import fit_inverse
+
+NAME = "ball-run"
+
+
+def linear(episodes: list, inputs: list):
+    """u = B^+ (x' - A x - c), clipped to the data's inputs; and the size of what the fit leaves of x'."""
+    found = fit_dynamics(episodes, inputs)
+    assert found is not None
+    dynamics = found[0]
+    A, B, c = (getattr(dynamics, name).float() for name in ("A", "B", "c"))
+    back = torch.linalg.pinv(B)
+
+    def inverse(x: Tensor, after: Tensor) -> Tensor:
+        return torch.clamp(
+            (after - x @ A.T - c) @ back.T, dynamics.low.float(), dynamics.high.float()
+        )
+
+    x, u, after = (
+        np.concatenate(p)
+        for p in zip(
+            *((e[:-1], i[: len(e) - 1], e[1:]) for e, i in zip(episodes, inputs, strict=True)),
+            strict=True,
+        )
+    )
+    left = after - x @ dynamics.A.numpy().T - u @ dynamics.B.numpy().T - dynamics.c.numpy()
+    return inverse, np.sqrt((left**2).mean(0))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    torch.set_num_threads(1)
+    both = {m: controller(resolve(Options(task=NAME, method=m))) for m in ("diffuser", "alm")}
+    recipe = resolve(Options(task=NAME)).recipe
+    task = both["alm"].task
+    episodes = demonstrations(task, recipe.demonstrations.steps, recipe.demonstrations.seed)
+    inputs = load_inputs(task, f"cdiff/{NAME}-v0")
+    table = Table(
+        title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}"
+    )
+    for title in (
+        "inverse dynamics",
+        "R² windows",
+        "R² random",
+        "method",
+        "return",
+        "violation rate / %",
+        "violating",
+    ):
+        table.add_column(title, justify="right" if title[0] in "Rrv" else "left")
+
+    def add(name: str, fits: tuple[str, str], changed: dict[str, Controller]) -> None:
+        for method, acting in changed.items():
+            found = act(
+                acting, range(asked.seed, asked.seed + asked.episodes), acting.g, {"collide": False}
+            )
+            table.add_row(
+                name,
+                *fits,
+                method,
+                found.returned(),
+                f"{found.mean('violation_rate'):.3f}",
+                found.violating(),
+            )
+
+    for ahead in (1, 2, 4, 8):
+        spec = InverseSpec(steps=8000, ahead=ahead)
+        net, fits = fit_inverse(episodes, inputs, recipe.horizon, spec, 0)
+        told = f"{fits['windows']:.4f}", f"{fits['branches']:.4f}"
+        add(
+            f"network, {ahead} ahead",
+            told,
+            {m: replace(c, inverse=net, ahead=ahead) for m, c in both.items()},
+        )
+    inverse, left = linear(episodes, inputs)
+    add("linear fit, 1 ahead", ("", ""), {m: replace(c, inverse=inverse) for m, c in both.items()})
+    Console(width=120).print(table)
+    Console(width=120).print(
+        f"the linear fit leaves {', '.join(f'{v:.1e}' for v in left)} of x, y (m), vx, vy (m/s), root mean square"
+    )
+
+
+if __name__ == "__main__":
+    main()

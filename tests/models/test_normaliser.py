@@ -1,0 +1,105 @@
+"""Relative windows, and the inverse dynamics model."""
+
+import numpy as np
+import pytest
+import torch
+
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.models.networks import ResidualMlp
+from cdiff_cli.models.recipe import InverseSpec
+from cdiff_cli.training.inverse_dynamics import fit_inverse
+from cdiff_cli.training.windows import Windows, fit_frame
+from tests.problems import F64, normal
+
+LAYOUT = ("x", "y", "v")
+A = np.array([[1.0, 0.0, 0.1], [0.0, 0.9, 0.0], [0.0, 0.0, 0.95]])
+B = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2]])
+
+
+def episode(seed: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """x' = A x + B u under random inputs, far from the origin."""
+    rng = np.random.default_rng(seed)
+    x, u = [np.array([100.0, 0.0, 1.0])], rng.uniform(-1, 1, (steps, 2))
+    for each in u:
+        x.append(A @ x[-1] + B @ each)
+    return np.stack(x), u
+
+
+WINDOWS = Windows.of([episode(seed, 200)[0] for seed in range(4)], 8)
+FRAME = fit_frame(WINDOWS, LAYOUT, (("x", "y"),), ("x",))
+
+
+def windows(n: int = 50) -> torch.Tensor:
+    return WINDOWS[torch.arange(0, len(WINDOWS.starts), len(WINDOWS.starts) // n)]
+
+
+def test_a_window_comes_back_from_its_frame():
+    x = windows()
+    torch.testing.assert_close(FRAME.at(x[:, 0]).decode(FRAME.encode(x)), x)
+
+
+def test_every_waypoint_has_its_own_scale_of_one():
+    z = FRAME.encode(WINDOWS[torch.arange(len(WINDOWS.starts))])[:, 1:]
+    torch.testing.assert_close(z.mean(0), torch.zeros(7, 3, dtype=F64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(z.std(0)[:, 2], torch.ones(7, dtype=F64))
+    torch.testing.assert_close(
+        z.std(0)[:, :2].amax(1), torch.ones(7, dtype=F64)
+    )  # x and y share theirs: the wider has one
+
+
+def test_what_follows_from_the_present_state_alone_is_in_the_frame():
+    """Windows of a linear system without inputs: nothing is left to guess."""
+    start = normal(3, 40, 3)
+    x = [start]
+    for _ in range(7):
+        x.append(x[-1] @ torch.from_numpy(A).T)
+    every = torch.stack(x, 1)
+    some = fit_frame(Windows.of(list(every[:30].numpy()), 8), LAYOUT, (), ())
+    torch.testing.assert_close(some.at(every[30:, 0]).centre[:, 1:], every[30:, 1:])
+
+
+def test_a_window_moved_along_an_invariant_coordinate_looks_the_same():
+    x = windows()
+    torch.testing.assert_close(FRAME.encode(x + torch.tensor([7.0, 0.0, 0.0])), FRAME.encode(x))
+    assert bool((FRAME.encode(x)[:, 0, 0] == 0).all())
+    assert not torch.allclose(FRAME.encode(x + torch.tensor([0.0, 7.0, 0.0])), FRAME.encode(x))
+
+
+def test_the_residual_network_hands_the_present_state_back():
+    x = normal(0, 5, 8, 3).float()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        out = ResidualMlp(3, 8, 32, 2)(x, torch.full((5,), 3.0))
+    assert out.shape == x.shape
+    assert torch.equal(out[:, 0], x[:, 0])
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """Forty long episodes and twenty short ones of the linear system, its inverse dynamics fitted."""
+    pairs = [episode(seed, 100 if seed < 40 else 5) for seed in range(60)]
+    spec = InverseSpec(width=64, steps=400, batch=256, learning_rate=3e-3)
+    episodes, inputs = zip(*pairs, strict=True)
+    return fit_inverse(episodes, inputs, 16, spec, 0)
+
+
+def test_the_inverse_dynamics_of_a_linear_system_are_found(fitted):
+    assert fitted[1]["windows"] > 0.98
+    assert fitted[1]["branches"] > 0.9
+
+
+def test_inputs_stay_within_those_of_the_data(fitted):
+    u = fitted[0](normal(0, 100, 3).float(), 50 * normal(1, 100, 3).float())
+    assert float(u.abs().max()) <= 1.0
+    assert float(u.abs().max()) > 0.9
+
+
+def test_without_inputs_there_is_no_inverse_dynamics_model():
+    with pytest.raises(CdiffError, match="no inputs"):
+        fit_inverse([episode(0, 100)[0]], [], 16, InverseSpec(), 0)
+
+
+def test_a_single_episode_is_fitted_to_and_none_is_held_out():
+    x, u = episode(0, 40)
+    _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), 0)
+    assert explained == {}

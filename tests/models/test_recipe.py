@@ -1,0 +1,100 @@
+"""Presets of a recipe: kernel and steps, how they are checked and what a command makes of them."""
+
+from typing import get_args
+
+import pytest
+
+from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.errors import CdiffError
+from cdiff_cli.models.recipe import Preset, Recipe
+from cdiff_cli.models.schedule import Schedule
+from cdiff_cli.paths import home
+from cdiff_cli.planning.open_loop import plan
+from cdiff_cli.sampling.kernels import KERNELS
+from cdiff_cli.yaml_files import load
+
+PRESETS = "presets:\n  fast:\n    kernel: dpm++2m\n    steps: 6\n    polish: true\n"
+
+
+def recipe(path, presets, n_steps=64):
+    """The U-maze's recipe with these presets in place of its own, read from a file."""
+    text = (home() / "models" / "maze2d-umaze" / "recipe.yaml").read_text()
+    path /= "recipe.yaml"
+    path.write_text(
+        text[: text.index("presets:")].replace("n_steps: 64", f"n_steps: {n_steps}") + presets
+    )
+    return load(path, Recipe)
+
+
+@pytest.fixture
+def fast(tmp_path, monkeypatch):
+    read = recipe(tmp_path, PRESETS)
+    monkeypatch.setattr("cdiff_cli.commands.resolve.load_recipe", lambda _: read)
+
+
+def test_a_preset_may_name_every_kernel():
+    assert set(get_args(Preset.model_fields["kernel"].annotation)) == set(KERNELS)
+
+
+@pytest.mark.usefixtures("fast")
+def test_a_preset_with_steps_plans_in_that_many_calls():
+    resolved = resolve(Options(preset="fast", n=1))
+    assert (resolved.kernel, resolved.problem.schedule) == (
+        "dpm++2m",
+        Schedule.cosine(64).respaced(6),
+    )
+    assert resolved.row()["preset"] == "fast"
+    plans = plan(resolved.problem, resolved.method, [0], kernel=resolved.kernel, polish=True)
+    assert plans.calls == 6
+    assert float((plans.x[..., 0] - plans.x[..., 1]).max()) <= 1.82
+
+
+@pytest.mark.usefixtures("fast")
+def test_steps_of_the_command_win_over_those_of_the_preset():
+    resolved = resolve(Options(preset="fast", steps=9))
+    assert resolved.problem.schedule == Schedule.cosine(64).respaced(9)
+    assert resolved.row()["preset"] == "fast*"
+
+
+def test_a_preset_without_steps_takes_all_as_trained():
+    assert resolve(Options()).problem.schedule == Schedule.cosine(64)
+
+
+def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
+    tmp_path, monkeypatch
+):
+    longer = recipe(
+        tmp_path, PRESETS.replace("6", "100"), n_steps=128
+    )  # the shipped checkpoint has 64
+    monkeypatch.setattr("cdiff_cli.commands.resolve.load_recipe", lambda _: longer)
+    with pytest.raises(
+        CdiffError, match=r'^preset "fast", steps: expected 1 to 64 \(as trained\), found 100$'
+    ):
+        resolve(Options(preset="fast"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        (
+            ("dpm++2m", "dpm2m"),
+            "presets.fast.kernel: expected 'ddpm', 'ddim', 'dpm++2m' or 'langevin', found 'dpm2m'",
+        ),
+        (("6", "0"), "presets.fast.steps: expected greater than 0, found 0"),
+        (("6", "-3"), "presets.fast.steps: expected greater than 0, found -3"),
+        (
+            ("6", "2.5"),
+            "presets.fast.steps: expected a valid integer, got a number with a fractional part, found 2.5",
+        ),
+        (
+            ("6", "many"),
+            "presets.fast.steps: expected a valid integer, unable to parse string as an integer, found 'many'",
+        ),
+        (("6", "65"), "presets.fast.steps: expected 1 to 64 (n_steps), found 65"),
+    ],
+)
+def test_a_bad_kernel_or_number_of_steps_in_a_preset_is_one_clear_line(wrong, complaint, tmp_path):
+    with pytest.raises(CdiffError) as error:
+        recipe(tmp_path, PRESETS.replace(*wrong))
+    assert complaint in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,227 @@
+"""The active set of the projection with dynamics: optimality by its own conditions, hard and infeasible problems, warm starts."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.projection.dynamics import nearest_reachable
+from cdiff_cli.projection.segments import planes
+from cdiff_cli.projection.solvers.active_set import AGAIN, Bounds, _at_active, settle
+from cdiff_cli.projection.solvers.lq_tracking import tracking
+from tests.problems import F64, ball, normal, num, pin, vec
+from tests.projection.test_dynamics import WEIGHT, distance, maze, noisy_path, qp, solve, trip
+
+seeds = st.integers(0, 10_000)
+WALL = vec(1.0, 0.5, 0.0, 0.0)
+
+
+def wall(b):
+    return Waypoints("wall", Affine(WALL[:2], num(b)))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=seeds, horizon=st.sampled_from([3, 20, 50]))
+def test_optimality_no_reachable_trajectory_on_the_way_to_another_is_nearer(seed, horizon):
+    """Of a convex problem the minimiser x has <x - z, y - x>_W >= 0 for every feasible y: here other inputs' trajectories."""
+    d = maze()
+    _, z = noisy_path(d, seed, 2, horizon)
+    x, warm = solve(d, z, pin(z, 0))
+    assert float(warm.u.abs().max()) <= 1 + 1e-8
+    for k in range(5):
+        y = d.rollout(z[:, 0], torch.clamp(normal(seed + 10 + k, 2, horizon - 1, 2), -1, 1))
+        slope = ((x - z) * WEIGHT * (y - x)).sum((1, 2))
+        assert bool(
+            (slope >= -1e-6 * (1 + distance(y, x))).all()
+        )  # what a row at its bound gives way, times its multiplier
+
+
+@pytest.mark.parametrize("seed", [6, 7, 8])
+def test_a_problem_with_half_of_its_rows_active_is_solved_from_nothing(seed):
+    """Noise that asks for six times the inputs there are, towards a wall: many rows change sides many times."""
+    d = maze()
+    _, z = noisy_path(d, seed, 1, 16)
+    z[:, 0, :2] = -0.05
+    expected = qp(d, z[0], [0], WALL, 0.0)
+    x, warm = solve(d, z, pin(z, 0), [wall(0.0)])
+    assert int(warm.active.abs().sum()) >= 10
+    torch.testing.assert_close(distance(x[0], z[0]), distance(expected, z[0]), atol=0, rtol=1e-6)
+    assert float((x[0] @ WALL).max()) <= 1e-8
+
+
+def test_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
+    d = maze()
+    _, z = noisy_path(d, 5, 3, 16)
+    z[:, 0, :2] = -0.2
+    expected, _ = solve(d, z, pin(z, 0), [wall(0.0)])
+    assert float((expected @ WALL).max()) <= 1e-8
+    monkeypatch.setattr("cdiff_cli.projection.solvers.active_set.PATIENCE", -1)
+    x, _ = solve(d, z, pin(z, 0), [wall(0.0)])
+    torch.testing.assert_close(x, expected, atol=1e-6, rtol=0)
+
+
+def test_a_warm_start_at_the_solution_takes_one_system_and_none_where_nothing_is_active(
+    monkeypatch,
+):
+    d = maze()
+    _, z = noisy_path(d, 5, 3, 16)
+    _, warm = solve(d, z, pin(z, 0), [wall(2.0)])
+    assert bool(warm.active.any())
+    solved = []
+    monkeypatch.setattr(
+        "cdiff_cli.projection.solvers.active_set._at_active",
+        lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of),
+    )
+    solve(d, z, pin(z, 0), [wall(2.0)], warm=warm)
+    assert solved == [int(warm.active.flatten(1).any(1).sum())]
+    solved.clear()
+    path = d.rollout(z[:, 0], torch.zeros(3, 15, 2, dtype=F64))
+    torch.testing.assert_close(solve(d, path, pin(path, 0))[0], path, atol=1e-9, rtol=0)
+    assert sum(solved) == 0
+
+
+def test_plans_that_are_safe_get_no_tangent_planes(monkeypatch):
+    d, z = maze(), torch.cat((trip(), trip()))
+    z[1, :, 1] += 1.0
+    asked = []
+    monkeypatch.setattr(
+        "cdiff_cli.projection.dynamics.planes",
+        lambda parts, x, pins: asked.append(len(x)) or planes(parts, x, pins),
+    )
+    x, _ = solve(d, z, pin(z, 0, 63), [Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))])
+    assert set(asked) == {1}
+    torch.testing.assert_close(x[1], z[1], atol=1e-8, rtol=0)
+
+
+def test_later_choices_of_planes_come_nearer():
+    d, z = maze(), trip()
+    part = Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))
+    far = [
+        float(distance(solve(d, z, pin(z, 0, 63), [part], turns=turns)[0], z))
+        for turns in (1, 2, 3)
+    ]
+    assert far[2] <= far[1] + 1e-9 <= far[0] + 2e-9
+    for turns in (1, 3):
+        x, _ = solve(d, z, pin(z, 0, 63), [part], turns=turns)
+        assert float(part(x[..., :2]).max()) <= 1e-8
+
+
+def test_rows_that_contradict_each_other_are_missed_by_both():
+    """A wall that the start is 0.1 m behind: position and inputs give way, and the result is finite."""
+    d = maze()
+    z = trip()
+    z[:, 0] = vec(0.1, 0.0, 1.0, 0.0)
+    x, warm = solve(d, z, pin(z, 0), [wall(0.0)])
+    assert bool(torch.isfinite(x).all())
+    assert float((x @ WALL).max()) > 0.01
+    assert float(warm.u.abs().max()) > 1.5
+
+
+def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_solved_once_it_is_feasible(
+    monkeypatch,
+):
+    """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
+    d = maze(bound=0.3)
+    z = trip()
+    near, far = (Segments("disc", ball(1, centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0))
+    _, warm = solve(d, z, pin(z, 0, 63), [near])
+    assert warm.soft.tolist() == [True]
+    solved = []
+    monkeypatch.setattr(
+        "cdiff_cli.projection.solvers.active_set._at_active",
+        lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of),
+    )
+    x, warm = solve(d, z + 1e-3, pin(z + 1e-3, 0, 63), [near], warm=warm, turns=3)
+    assert len(solved) <= 1 + AGAIN
+    assert warm.soft.tolist() == [True]
+    assert bool(torch.isfinite(x).all())
+    expected, _ = solve(maze(), z, pin(z, 0, 63), [far])
+    for _ in range(
+        4
+    ):  # rows that pull where nothing is in the way any more leave all at once, then the inputs settle
+        x, warm = solve(maze(), z, pin(z, 0, 63), [far], warm=warm)
+    assert warm.soft.tolist() == [False]
+    torch.testing.assert_close(x, expected, atol=1e-8, rtol=0)
+
+
+def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give():
+    """Two walls that face away from each other, a decimetre apart: the path ends in the middle between them."""
+    d, z = maze(bound=1e6), torch.zeros(1, 3, 4, dtype=F64)
+    z[:, 1:, 0] = 0.05
+    walls = [
+        Waypoints("below", Affine(vec(1.0, 0.0), num(0.0))),
+        Waypoints("above", Affine(vec(-1.0, 0.0), num(-0.1))),
+    ]
+    x, warm = solve(d, z, pin(z, 0), walls)
+    assert warm.soft.tolist() == [True]
+    torch.testing.assert_close(
+        x[0, 1:, 0], vec(0.05, 0.05), atol=1e-4, rtol=0
+    )  # the way there has a cost too: 1e-5
+
+
+def test_a_plan_does_not_depend_on_the_others_of_its_batch():
+    d = maze()
+    _, z = noisy_path(d, 9, 6, 40)
+    z[:, 0, :2] -= 0.5
+    part = Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.2))
+    whole, _ = solve(d, z, pin(z, 0), [part, wall(0.3)])
+    alone = torch.cat([solve(d, one[None], pin(one[None], 0), [part, wall(0.3)])[0] for one in z])
+    torch.testing.assert_close(whole, alone, atol=1e-8, rtol=0)
+
+
+def test_half_spaces_at_states_of_three_coordinates():
+    """Rows over used coordinates out of order and with a gap: position y and both velocities."""
+    d, a = maze(), vec(0.3, 1.0, 0.2)
+    _, z = noisy_path(d, 2, 2, 30)
+    whole = vec(0.0, 0.3, 1.0, 0.2)
+    b = float((z[:, 0] @ whole).max()) + 0.1
+    x, _ = nearest_reachable(
+        d,
+        [Waypoints("w", Affine(a, num(b)))],
+        None,
+        z,
+        pin(z, 0),
+        used=(1, 2, 3),
+        weight=WEIGHT,
+        rounds=1,
+        tolerance=1e-9,
+    )
+    for k in range(2):
+        expected = qp(d, z[k], [0], whole, b)
+        torch.testing.assert_close(
+            distance(x[k], z[k]), distance(expected, z[k]), atol=0, rtol=1e-6
+        )
+
+
+def test_what_has_no_rows_is_met_by_admm_around_the_active_set():
+    """A slab |y| <= 0.04 given as a projection alone is met as its half-spaces are."""
+    d, z = maze(), trip()
+    z[:, 0, 1] = 0.0
+    upper, lower = (
+        Waypoints("u", Affine(vec(0.0, 1.0), num(0.04))),
+        Waypoints("l", Affine(vec(0.0, -1.0), num(0.04))),
+    )
+    expected, _ = solve(d, z, pin(z, 0), [upper, lower])
+
+    def onto(x, _):
+        return torch.stack((x[..., 0], x[..., 1].clamp(-0.04, 0.04)), -1)
+
+    x, _ = solve(d, z, pin(z, 0), rest=onto, rounds=2000, tolerance=1e-7)
+    torch.testing.assert_close(x[..., :2], expected[..., :2], atol=1e-4, rtol=0)
+
+
+def test_settling_nothing_returns_the_unconstrained_solution():
+    d = maze()
+    w0 = 0.1 * normal(0, 2, 7, 6)
+    numbers = tuple(tuple(v.flatten().tolist()) for v in (d.A, d.B, d.c))
+    track = tracking(numbers, tuple(WEIGHT.tolist()), 7, False, w0.device)
+    none = torch.zeros(2, 7, 2, dtype=torch.int8)
+    empty = (w0.new_zeros(2, 7, 0, 0), w0.new_zeros(2, 7, 0))
+    w, active, soft = settle(
+        track, w0, Bounds(d.low, d.high, [], 1e-9), *empty, none, torch.zeros(2).bool()
+    )
+    assert torch.equal(w, w0)
+    assert not bool(active.any() | soft.any())

@@ -1,0 +1,436 @@
+"""Trajectory laws whose score is exact, their true constrained laws, and what separates a method's samples from them.
+
+The law is a mixture of Gaussian-process bridges in the plane: component k is N(m_k, s_k^2 C) in x and in y, with
+C = V diag(l) V^T the covariance of a smooth bridge, zero at the start and the goal. With a = alpha_bar_t
+
+    E[x_0 | x_t] = sum_k w_k(x_t) (m_k + V diag(sqrt(a) s_k^2 l / v_k) V^T (x_t - sqrt(a) m_k)),   v_k = a s_k^2 l + 1 - a
+    w_k  proportional to  p_k N(x_t; sqrt(a) m_k, V diag(v_k) V^T)
+
+The constrained law is this law given g <= 0 at every waypoint; rejection samples it without any diffusion.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cdiff_cli.arrays import Traj
+from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
+from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.evaluation import metrics
+from cdiff_cli.models.denoiser import Denoiser
+from cdiff_cli.models.normaliser import Normaliser
+from cdiff_cli.models.recipe import Preset, load_recipe
+from cdiff_cli.models.schedule import Schedule
+from cdiff_cli.planning.open_loop import plan, polish_plans
+from cdiff_cli.planning.problem import Problem
+from cdiff_cli.projection.project import project
+from cdiff_cli.sampling.methods import METHODS, Unconstrained, make_method
+from cdiff_cli.sampling.sampler import Method, Step
+
+Array = NDArray[np.float64]
+F64 = torch.float64
+SCALE = 1.4  # metres a normalised unit, as in the U-maze
+SAFE = 1e-5  # g up to this counts as kept: float32 rounding of a plan that was not polished
+
+
+@dataclass(frozen=True)
+class Routes:
+    """A mixture of smooth Gaussian bridges from a start to a goal, in environment units (metres).
+
+    means     mean paths, equal at both ends      [K, horizon, 2]
+    std       largest standard deviation of each  [K]
+    weights   probability of each                 [K]
+    length    correlation length of the deviations, as a share of the horizon
+    """
+
+    means: Tensor
+    std: Tensor
+    weights: Tensor
+    length: float = 0.4
+
+    # the seam to cdiff_cli.tasks: all that planning.plan asks of a task
+    layout = ("x", "y")
+    positions = ("x", "y")
+
+    @property
+    def horizon(self) -> int:
+        return self.means.shape[1]
+
+    @cached_property
+    def modes(self) -> tuple[Tensor, Tensor]:
+        """Eigenvalues [horizon] and eigenvectors [horizon, horizon] of the bridge's covariance, its largest variance 1."""
+        s = torch.linspace(0, 1, self.horizon, dtype=F64)
+        r = math.sqrt(5) * (s[:, None] - s).abs() / self.length
+        kernel = (1 + r + r * r / 3) * torch.exp(-r)  # Matern 5/2: two derivatives
+        ends = kernel[:, [0, -1]]
+        bridge = kernel - ends @ torch.linalg.solve(kernel[[0, -1]][:, [0, -1]], ends.T)
+        values, vectors = torch.linalg.eigh(bridge / bridge.diagonal().max())
+        return values.clamp_min(0), vectors
+
+    def draw(self, n: int, generator: torch.Generator) -> Tensor:
+        """Exact samples of the unconstrained law [n, horizon, 2]."""
+        values, vectors = self.modes
+        k = torch.multinomial(self.weights, n, replacement=True, generator=generator)
+        z = torch.randn(n, self.horizon, 2, generator=generator, dtype=F64)
+        return self.means[k] + self.std[k, None, None] * (vectors * values.sqrt()) @ z
+
+    def truth(self, g: Constraint, n: int, generator: torch.Generator) -> tuple[Array, float]:
+        """n exact samples of the law given g <= 0 at every waypoint, and the share of draws that were accepted."""
+        kept, drawn = [], 0
+        while sum(map(len, kept)) < n:
+            x = self.draw(4 * n, generator)
+            drawn += len(x)
+            kept.append(x[(g(x) <= 0).all(1)])
+        found = torch.cat(kept)
+        return found[:n].numpy(), len(found) / drawn
+
+    def denoiser(self, schedule: Schedule) -> Denoiser:
+        """(x_t, t) -> E[x_0 | x_t] in normalised coordinates z = x / SCALE, in the dtype of x_t."""
+        level = dict(zip(schedule.t, schedule.alpha_bar, strict=True))
+        values, vectors = self.modes
+        variance = self.std.square()[:, None] * values / SCALE**2  # [K, horizon]
+        means = self.means / SCALE
+
+        def clean(z: Traj, t: int) -> Traj:
+            a = level[t]
+            total = a * variance + 1 - a
+            V, m = vectors.to(z), means.to(z)
+            left = V.T @ (z[:, None] - math.sqrt(a) * m)  # [n, K, horizon, 2]
+            # both ends are pinned to the means' own values: they add the same to every component
+            log_weight = self.weights.log() - total.log().sum(-1)
+            exponent = (left.square().sum(-1) / total.to(z)).sum(-1) / 2
+            weight = torch.softmax(log_weight.to(z) - exponent, 1)
+            gain = (math.sqrt(a) * variance / total).to(z)
+            each = m + V @ (gain[..., None] * left)
+            return (weight[..., None, None] * each).sum(1)
+
+        return clean
+
+    def route(self, x: Array) -> NDArray[np.int64]:
+        """Which mean path is nearest [n]."""
+        return np.linalg.norm(x[:, None] - self.means.numpy(), axis=(2, 3)).argmin(1)
+
+
+def three_routes(horizon: int = 32) -> Routes:
+    """Over, under and straight through, from (-1.2, 0) to (1.2, 0): 45, 35 and 20 % of the trajectories."""
+    s = torch.linspace(0, 1, horizon, dtype=F64)
+    x = -1.2 * torch.cos(math.pi * s)  # from rest to rest
+    height = torch.tensor([0.9, -0.9, 0.0], dtype=F64)
+    y = height[:, None] * torch.sin(math.pi * s) ** 2
+    means = torch.stack((x.expand_as(y), y), -1)
+    return Routes(
+        means, torch.tensor([0.2, 0.2, 0.15], dtype=F64), torch.tensor([0.45, 0.35, 0.2], dtype=F64)
+    )
+
+
+# constraints, in metres ---------------------------------------------------------------------------------------------------
+
+
+def _half_space(x: float, y: float, b: float) -> Affine:
+    return Affine(torch.tensor([x, y], dtype=F64), torch.tensor(b, dtype=F64))
+
+
+def _outside(x: float, y: float, radius: float) -> Ellipsoid:
+    one = torch.ones(2, dtype=F64)
+    return Ellipsoid(
+        torch.eye(2, dtype=F64), torch.tensor([x, y], dtype=F64), radius * one, radius * one[0], 1
+    )
+
+
+CONSTRAINTS = {
+    "corner": Constraint((Waypoints("corner", _half_space(0.5, 0.866, 0.75)),)),
+    "disc": Constraint((Waypoints("disc", _outside(0.0, 0.9, 0.2)),)),
+    "wide disc": Constraint((Waypoints("wide disc", _outside(0.0, 0.45, 0.4)),)),
+    "slab": Constraint(
+        (
+            Waypoints("above", _half_space(0.0, 1.0, 0.8)),
+            Waypoints("below", _half_space(0.0, -1.0, 0.8)),
+        )
+    ),
+    "discs": Constraint(
+        tuple(
+            Waypoints(f"disc {k}", _outside(0.0, y, 0.25)) for k, y in enumerate((0.9, -0.9, 0.0))
+        )
+    ),
+    "chain": Constraint((Chain("chain", _half_space(0.0, 1.0, 1.0), 0.12),)),
+}
+
+
+def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
+    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the waypoints, where the truth has it."""
+    schedule = Schedule.cosine(n_steps)
+    scale = Normaliser(torch.zeros(2, dtype=F64), torch.full((2,), SCALE, dtype=F64))
+    start, goal = law.means[0, [0, -1]].numpy()
+    return Problem(
+        law,
+        law.horizon,
+        law.denoiser(schedule),
+        schedule,
+        scale,
+        g,
+        g,
+        start,
+        goal,
+        torch.device("cpu"),
+    )
+
+
+# what separates samples from the truth ------------------------------------------------------------------------------------
+
+
+def energy_distance(x: Array, y: Array) -> float:
+    """2 E|x - y| - E|x - x'| - E|y - y'|, |.| the root mean square distance of waypoints, in metres.
+
+    Unbiased (no pair of a sample with itself): zero on average where both have one law, and it can come out negative.
+    """
+    if min(len(x), len(y)) < 2:
+        return math.nan
+    a, b = (torch.from_numpy(v).flatten(1) / math.sqrt(v.shape[1]) for v in (x, y))
+    within = [torch.cdist(v, v).sum() / (len(v) * (len(v) - 1)) for v in (a, b)]
+    return float(2 * torch.cdist(a, b).mean() - within[0] - within[1])
+
+
+def route_shares(law: Routes, x: Array) -> Array:
+    """Share of the samples on each route [K]."""
+    return np.bincount(law.route(x), minlength=len(law.means)) / len(x)
+
+
+def energy_within_routes(law: Routes, x: Array, truth: Array) -> float:
+    """Energy distance of the samples on one route to the true ones on it, mean over the truth's shares: what is left once the
+    mass on each route is right. Routes of fewer than 20 samples on either side are left out.
+    """
+    mine, theirs = law.route(x), law.route(truth)
+    pairs = [(x[mine == k], truth[theirs == k]) for k in range(len(law.means))]
+    pairs = [(a, b) for a, b in pairs if min(len(a), len(b)) >= 20]
+    each = [energy_distance(a, b) for a, b in pairs]
+    return float(np.average(each, weights=[len(b) for _, b in pairs])) if pairs else math.nan
+
+
+def jump_limit(truth: Array) -> float:
+    """The 99.9 % quantile of the true samples' largest jump: a plan beyond it is torn."""
+    return float(np.quantile(metrics.jump(truth, (0, 1)), 0.999))
+
+
+def measure(
+    law: Routes, g: Constraint, x: Array, x_free: Array, truth: Array, limit: float
+) -> dict[str, float]:
+    """Every measure of samples x [n, horizon, 2]; x_free are the unconstrained ones of the same noise."""
+    return {
+        "energy": energy_distance(x, truth),
+        "within": energy_within_routes(law, x, truth),
+        "unsafe": float((metrics.worst_waypoint(g, x) > SAFE).mean()),
+        "unsafe_segments": float((metrics.worst_segment(g, x) > SAFE).mean()),
+        "torn": float((metrics.jump(x, (0, 1)) > limit).mean()),
+        "distance": float(metrics.distance(x, x_free, (0, 1)).mean()),
+        **{f"route_{k}": float(share) for k, share in enumerate(route_shares(law, x))},
+    }
+
+
+# variants of a method ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Latent:
+    """A method on the clean estimate whose shift of it is carried to x_t as well, so that the noise estimate stays:
+
+        x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0),   a, b = alpha_bar_t, alpha_bar_{t-1}
+
+    DDPM's reverse(x0') - reverse(x0) is only beta_t / (1 - a) of that, its coefficient of x0 over sqrt(b). For DDIM the same
+    holds with 1 - sqrt(a (1 - b) / (b (1 - a))). The whole shift is made at each step, so more steps push harder, where
+    the plain one approaches a limit.
+    """
+
+    inner: Method
+    schedule: Schedule
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        return self.inner.init(x, g), self.schedule.n_steps
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        inner, i = state
+        level = math.sqrt(self.schedule.alpha_bar[i - 1])
+        plain = step.reverse(step.x0)
+        x, inner = self.inner.step(
+            replace(step, reverse=lambda clean: plain + level * (clean - step.x0)), g, inner
+        )
+        return x, (inner, max(i - 1, 1))
+
+
+@dataclass(frozen=True)
+class Over:
+    """Projection of the clean estimate, overdone: x0' = x0 + fold (P(x0) - x0), the last one exact."""
+
+    fold: float
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        fold = 1.0 if step.last else self.fold
+        return step.reverse(step.x0 + fold * (project(g, step.x0, step.pins) - step.x0)), state
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Latent projection that asks the network about the shifted x_t before it goes on: two calls a step."""
+
+    schedule: Schedule
+    denoiser: Denoiser
+
+    def init(self, x: Traj, g: Constraint) -> int:
+        return self.schedule.n_steps
+
+    def step(self, step: Step, g: Constraint, i: int) -> tuple[Traj, int]:
+        a, b = self.schedule.alpha_bar[i], self.schedule.alpha_bar[i - 1]
+        shift = project(g, step.x0, step.pins) - step.x0
+        x0 = step.pins.paint(self.denoiser(step.x + math.sqrt(a) * shift, self.schedule.t[i]))
+        carried = math.sqrt(b) * (1 - step.beta / (1 - a))  # of the shift of x_t, by DDPM
+        return step.reverse(project(g, x0, step.pins)) + carried * shift, max(i - 1, 1)
+
+
+@dataclass(frozen=True)
+class Late:
+    """A method that acts in the last `steps` of n_steps only; before them the sampler is left alone."""
+
+    inner: Method
+    steps: int
+    n_steps: int
+
+    def init(self, x: Traj, g: Constraint) -> Any:
+        return self.inner.init(x, g), self.n_steps
+
+    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
+        inner, i = state
+        if i > self.steps:
+            return step.reverse(step.x0), (inner, i - 1)
+        x, inner = self.inner.step(step, g, inner)
+        return x, (inner, max(i - 1, 1))
+
+
+# runs ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way to sample the constrained law.
+
+    preset   kernel, extra steps and polish, as in a recipe
+    k        candidates a plan, of which the first that obeys is kept, else the one that violates least
+    steps    steps of the respaced schedule, None for all
+    repair   a plan of which no candidate obeys: its noise sampled again by this method, None: the polish alone
+    """
+
+    name: str
+    method: Method
+    preset: Preset
+    k: int = 1
+    steps: int | None = None
+    repair: Method | None = None
+
+
+def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
+    """Every method under every preset of a task's recipe; the unconstrained one, alike in all, once."""
+    runs = [Run("diffuser", Unconstrained(), Preset())]
+    for label, preset in load_recipe(task).presets.items():
+        for name in METHODS:
+            if name not in (
+                "diffuser",
+                "conditional",
+            ):  # the one is there, the other needs training
+                own = preset.model_copy(update={"extra_steps": preset.extra_steps_for(name)})
+                runs.append(
+                    Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), own)
+                )
+    return runs
+
+
+def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
+    """What `recommended` could be instead, all with its final polish."""
+    preset = load_recipe(task).presets["recommended"]
+    schedule, n_steps = at.schedule, at.schedule.n_steps
+    few = schedule.respaced(n_steps // 4)
+    clean = {
+        name: make_method(name, preset.methods[name])
+        for name in ("projected", "primal-dual", "alm")
+    }
+    projected = clean["projected"]
+    half = Late(projected, n_steps // 2, n_steps)
+    plain = Unconstrained()
+    return [
+        *(
+            Run(f"latent {name}", Latent(method, schedule), preset)
+            for name, method in clean.items()
+        ),
+        Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), preset),
+        Run("latent projected, 2 calls", Asked(schedule, at.denoiser), preset),
+        Run("latent projected, last half", Latent(half, schedule), preset),
+        Run("projected, last half", half, preset),
+        Run("projected, final only", Late(projected, 1, n_steps), preset),
+        Run(f"best of 4, {few.n_steps} steps", plain, preset, k=4, steps=few.n_steps),
+        Run(
+            f"best of 4, {few.n_steps} steps, else latent",
+            plain,
+            preset,
+            k=4,
+            steps=few.n_steps,
+            repair=Latent(projected, few),
+        ),
+        Run(f"best of 4, {n_steps} steps", plain, preset, k=4),
+        Run(
+            f"best of 4, {n_steps} steps, else latent",
+            plain,
+            preset,
+            k=4,
+            repair=Latent(projected, schedule),
+        ),
+    ]
+
+
+def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
+    """Samples [n, horizon, 2], one a seed, and network calls a plan, counted at the denoiser."""
+    asked = 0
+
+    def counted(z: Traj, t: int) -> Traj:
+        nonlocal asked
+        asked += len(z)
+        return at.denoiser(z, t)
+
+    here = replace(
+        at,
+        denoiser=counted,
+        schedule=at.schedule if run.steps is None else at.schedule.respaced(run.steps),
+    )
+    preset = run.preset
+
+    def plans(method: Method, draws: Sequence[int]) -> Array:
+        kernel, extra = preset.kernel, preset.extra_steps
+        return plan(here, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish).x
+
+    if run.k == 1:
+        x = plans(
+            replace(run.method, denoiser=counted) if isinstance(run.method, Asked) else run.method,
+            seeds,
+        )
+        return x, asked / len(seeds)
+    draws = (
+        np.array(seeds) + 10_000_000 * np.arange(run.k)[:, None]
+    )  # [k, n], the first those of every other run
+    candidates = plans(run.method, draws.ravel().tolist()).reshape(run.k, len(seeds), at.horizon, 2)
+    worst = np.stack([metrics.worst_waypoint(at.g, x) for x in candidates]).clip(min=0)
+    best, each = worst.argmin(0), np.arange(len(seeds))
+    x, bad = candidates[best, each], worst[best, each] > 0
+    if bad.any() and run.repair is not None:
+        x[bad] = plans(run.repair, draws[best, each][bad].tolist())
+    elif bad.any():
+        z = at.normaliser.encode(torch.from_numpy(x[bad]))
+        x[bad] = at.normaliser.decode(polish_plans(at, z)[0]).numpy()
+    return x, asked / len(seeds)

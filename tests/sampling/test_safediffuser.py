@@ -1,0 +1,236 @@
+"""SafeDiffuser: known answers of each variant, the two solvers agree, what never moves."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdiff_cli.constraints.black_box import Opaque
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.errors import CdiffError, InfeasibleError
+from cdiff_cli.models.schedule import Schedule
+from cdiff_cli.sampling.methods import Unconstrained, make_method
+from cdiff_cli.sampling.safediffuser import SafeDiffuser, _multipliers, jacobian, relaxation
+from cdiff_cli.sampling.sampler import Step, sample
+from tests.problems import (
+    F64,
+    KINDS,
+    ball,
+    chain,
+    dense_jacobian,
+    draws,
+    gaussian_denoiser,
+    half_space,
+    normal,
+    num,
+    pin,
+    qp_project,
+    vec,
+    waypoints,
+)
+
+COUPLED = ["dcbf over half-space", "dcbf over outside ball", "stack", "opaque"]
+
+
+def step_of(x, asked, left=0, pins=None):
+    """The step from x whose sample is `asked`."""
+    return Step(x, x, 0.1, 1.0, lambda _: asked, pins or Pins.none(x), left == 0, left)
+
+
+def moved(method, g, x, asked, left=0, pins=None):
+    return method.step(step_of(x, asked, left, pins), g, None)[0]
+
+
+def test_ros_moves_a_half_space_violation_by_its_closed_form():
+    """a.u <= k (b - margin - a.x): x + u0 - a [a.u0 - k (b - margin - a.x)]_+ / |a|^2."""
+    x, asked = normal(0, 5, 4, 2), normal(1, 5, 4, 2)
+    a, b = vec(1.0, -2.0), 0.3
+    out = moved(SafeDiffuser(gain=0.5, margin=0.1), waypoints(Affine(a, num(b))), x, asked)
+    over = ((asked - x) @ a - 0.5 * (b - 0.1 - x @ a)).clamp_min(0)
+    assert float(over.max()) > 0.5
+    torch.testing.assert_close(
+        out, asked - over[..., None] * a / 5.0, atol=1e-9, rtol=0
+    )  # a ridge of 1e-11 in the dual
+
+
+def test_with_gain_one_a_half_space_is_met_by_its_margin():
+    g = waypoints(half_space(b=-1.0))
+    out = moved(SafeDiffuser(), g, normal(0, 5, 4, 2), normal(1, 5, 4, 2))
+    assert float(g(out).max()) == pytest.approx(-0.01, abs=1e-9)
+
+
+def test_a_ball_is_linearised_at_x_t_and_its_outside_kept():
+    """The tangent half-space lies within the outside of a ball: with gain one x_{t-1} is safe by the margin or more."""
+    g, x, asked = waypoints(ball(1)), normal(2, 20, 3, 2), normal(3, 20, 3, 2, scale=0.5)
+    assert float(g(asked).max()) > 0.1
+    assert float(g(moved(SafeDiffuser(), g, x, asked)).max()) <= -0.01 + 1e-9
+
+
+def test_res_leaves_early_steps_almost_alone_and_ends_as_ros():
+    """At cost r^2 / 2 and weight w a row moves u by over / (|a|^2 + w^2) of it: w = 100 while 10 steps are left, then 0."""
+    g, x, asked = waypoints(half_space(b=-1.0)), normal(0, 5, 4, 2), normal(1, 5, 4, 2)
+    ros = moved(SafeDiffuser(), g, x, asked) - asked
+    early = moved(SafeDiffuser(variant="res"), g, x, asked, left=10) - asked
+    torch.testing.assert_close(early, ros * 2 / (2 + 100**2), atol=1e-9, rtol=0)
+    torch.testing.assert_close(moved(SafeDiffuser(variant="res"), g, x, asked, left=9) - asked, ros)
+
+
+def test_tvs_relaxes_the_barrier_by_a_sigmoid_of_the_steps_left():
+    assert relaxation(5) == (0.5, 0.25)
+    assert relaxation(1000) == pytest.approx((1.0, 0.0))
+    s = 1 / (1 + math.exp(-5))
+    assert relaxation(0) == pytest.approx((1 - s, s * (1 - s)))
+    g, x = waypoints(half_space(b=-1.0)), torch.zeros(1, 1, 2, dtype=F64)
+    asked = x + vec(2.0, -2.0)  # g = x - y + 1: 1 at x_t, 5 as asked
+    out = moved(SafeDiffuser(variant="tvs"), g, x, asked, left=5)
+    assert float(g(out)) == pytest.approx(
+        0.5 - 0.01 + 0.25, abs=1e-9
+    )  # g + dg.u <= gamma - margin + slope
+
+
+@pytest.mark.parametrize(
+    "kind", ["half-space", "outside ball", "inside ellipsoid", "general quadric", *COUPLED]
+)
+@pytest.mark.parametrize("variant", ["ros", "res", "tvs"])
+def test_closed_form_is_what_proxqp_finds(kind, variant):
+    g, x, asked = KINDS[kind], normal(4, 4, 6, 2), normal(5, 4, 6, 2)
+    pins = (
+        Pins.none(x) if kind == "stack" else pin(x, 0)
+    )  # whose rows contradict each other once x_t's first state is held
+    asked = pins.paint(asked)
+    both = [
+        moved(SafeDiffuser(variant, solver), g, x, asked, left=3, pins=pins)
+        for solver in ("closed-form", "proxqp")
+    ]
+    torch.testing.assert_close(
+        *both, atol=1e-6, rtol=0
+    )  # ProxQP's 1e-9 over the conditioning of a dozen coupled rows
+
+
+def test_rows_of_several_barriers_at_one_waypoint_are_solved_together():
+    g = Constraint(
+        tuple(Waypoints(str(i), Affine(vec(math.cos(i), math.sin(i)), num(0.1))) for i in range(6))
+    )
+    x, asked = 0.1 * normal(6, 30, 4, 2), normal(7, 30, 4, 2, scale=2.0)
+    both = [moved(SafeDiffuser(solver=solver), g, x, asked) for solver in ("closed-form", "proxqp")]
+    torch.testing.assert_close(*both, atol=1e-7, rtol=0)
+    assert float(g(both[0]).max()) <= -0.01 + 1e-9
+
+
+@settings(max_examples=40, deadline=None)
+@given(n=st.integers(1, 12), k=st.integers(1, 12), seed=st.integers(0, 10_000))
+def test_the_dual_meets_its_optimality_conditions(n, k, seed):
+    """lam >= 0, M lam >= d, lam.(M lam - d) = 0, where M = A A^T + I / 10 is positive definite."""
+    A, d = normal(seed, 3, n, k), normal(seed + 1, 3, n)
+    M = A @ A.mT + 0.1 * torch.eye(n, dtype=F64)
+    lam = _multipliers(M, d)
+    gap = (M @ lam[..., None])[..., 0] - d
+    assert float(lam.min()) >= 0
+    assert (
+        float(gap.min()) >= -1e-7
+    )  # the ridge of 1e-11 |M|, |M| up to 50, times multipliers up to 100
+    assert float((lam * gap).abs().max()) <= 1e-5  # again times those multipliers
+
+
+@pytest.mark.parametrize("kind", ["dcbf over outside ball", "stack", "opaque"])
+def test_jacobian_rows_are_those_of_autograd(kind):
+    x = normal(8, 1, 5, 2)
+    J = torch.cat([jacobian(part, x) for part in KINDS[kind].parts], 1)
+    torch.testing.assert_close(
+        J[0].flatten(1), torch.from_numpy(dense_jacobian(KINDS[kind], x)[0]), atol=1e-12, rtol=0
+    )
+
+
+def test_a_chain_is_one_qp_over_the_whole_plan():
+    """Against ProxQP on the rows written out by autograd: J u <= -margin - g(x)."""
+    g, x, asked = chain(half_space(), 0.2), normal(9, 1, 8, 2), normal(10, 1, 8, 2)
+    J, _ = dense_jacobian(g, x)
+    u = qp_project(J, (-0.01 - g(x)[0]).numpy(), (asked - x).flatten().numpy())
+    torch.testing.assert_close(
+        moved(SafeDiffuser(), g, x, asked),
+        x + torch.from_numpy(u).reshape(x.shape),
+        atol=1e-7,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("solver", ["closed-form", "proxqp"])
+@pytest.mark.parametrize("kind", ["half-space", "dcbf over half-space"])
+def test_pinned_waypoints_do_not_move(kind, solver):
+    x = normal(11, 4, 5, 2, scale=2.0)
+    ends = [0] if "dcbf" in kind else [0, -1]  # both ends of a chain held anywhere contradict it
+    pins = pin(x, *ends)
+    asked = pins.paint(normal(12, 4, 5, 2, scale=2.0))
+    out = moved(SafeDiffuser(solver=solver), KINDS[kind], x, asked, pins=pins)
+    assert torch.equal(out[:, ends], x[:, ends])
+    assert not torch.equal(out, asked)
+
+
+def test_steps_that_are_safe_already_stay_as_sampled_to_the_last_bit():
+    g, x, asked = (
+        waypoints(half_space(b=50.0)),
+        normal(13, 4, 5, 2).float(),
+        normal(14, 4, 5, 2).float(),
+    )
+    assert torch.equal(moved(SafeDiffuser(), g.to(x), x, asked), asked)
+
+
+@pytest.mark.parametrize("solver", ["closed-form", "proxqp"])
+def test_barriers_that_contradict_each_other_are_said_aloud(solver):
+    g = Constraint(
+        (
+            Waypoints("up", Affine(vec(-1.0, 0.0), num(-1.0))),
+            Waypoints("down", Affine(vec(1.0, 0.0), num(-1.0))),
+        )
+    )
+    x = torch.zeros(1, 2, 2, dtype=F64)
+    with pytest.raises(InfeasibleError, match=r"contradict each other.*variant=res"):
+        moved(SafeDiffuser(solver=solver), g, x, x + 1)
+
+
+@pytest.mark.parametrize("variant", ["ros", "res"])
+def test_whole_plans_end_safe(variant):
+    schedule = Schedule.cosine(20)
+    g, like = waypoints(Affine(vec(1.0, 1.0), num(0.8))), torch.zeros(8, 4, 2, dtype=F64)
+    plans = [
+        sample(
+            gaussian_denoiser(schedule, 0.5, 0.1),
+            schedule,
+            method,
+            g,
+            Pins.none(like),
+            draws(7, 8, 4, 2),
+        )
+        for method in (Unconstrained(), SafeDiffuser(variant))
+    ]
+    assert float(g(plans[0]).max()) > 0.1
+    assert float(g(plans[1]).max()) <= -0.01 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"variant": "rose"}, "safediffuser.variant: expected one of ros, res, tvs, found 'rose'"),
+        (
+            {"solver": "qpth"},
+            "safediffuser.solver: expected one of closed-form, proxqp, found 'qpth'",
+        ),
+        ({"margin": -1}, "safediffuser.margin: expected a positive number"),
+        ({"kind": 1}, 'safediffuser has no setting "kind".*variant, solver, gain, margin'),
+    ],
+)
+def test_a_bad_setting_is_one_clear_line(values, message):
+    with pytest.raises(CdiffError, match=message):
+        make_method("safediffuser", values)
+
+
+def test_opaque_rows_count_as_coupled():
+    g = Constraint((Opaque("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
+    x = torch.zeros(1, 3, 2, dtype=F64)
+    out = moved(SafeDiffuser(), g, x, x + 1.0)  # sum 6: the nearest with sum 0.99
+    torch.testing.assert_close(out, torch.full_like(x, 0.99 / 6), atol=1e-9, rtol=0)
