@@ -1,4 +1,4 @@
-"""Fill the generated blocks of README.md and of the pages in docs/: `make pages` writes them, tests/test_docs.py fails when they drift.
+"""Fill the generated blocks of README.md and docs/: `make pages` writes them, tests/test_docs.py fails when they drift.
 
 A block stands between `<!-- NAME -->` and `<!-- end -->`; NAME is one of BLOCKS:
 
@@ -186,7 +186,9 @@ def lead_and_rest(doc: str) -> tuple[str, str]:
 
 
 def kinds_table() -> str:
-    lines = [f"| `{kind}` | {in_cell(lead_and_rest(cls.__doc__ or '')[0])} | `{checked_example(kind)}` |" for kind, cls in kind_classes()]
+    lines = [
+        f"| `{kind}` | {in_cell(lead_and_rest(cls.__doc__ or '')[0])} | `{checked_example(kind)}` |" for kind, cls in kind_classes()
+    ]
     return "\n".join(["| kind | it means | example |", "| --- | --- | --- |", *lines])
 
 
@@ -214,7 +216,9 @@ def type_of(field: dict[str, Any]) -> str:
         return f"list of {type_of(items[0])}" + (f", {len(items)} of them" if "prefixItems" in field else "")
     limits = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
     bounds = ", ".join(f"{sign} {field[name]:g}" for name, sign in limits.items() if name in field)
-    name = {"string": "name" if "observed" in field.get("description", "") else "text"}.get(field.get("type", ""), field.get("type"))
+    name = {"string": "name" if "observed" in field.get("description", "") else "text"}.get(
+        field.get("type", ""), field.get("type")
+    )
     return f"{name or 'any'}{' ' + bounds if bounds else ''}"
 
 
@@ -222,7 +226,9 @@ def fields_table(schema: dict[str, Any]) -> str:
     required = set(schema.get("required", ()))
     lines = []
     for name, field in schema["properties"].items():
-        default = "required" if name in required else "" if field.get("default") in (None, "") else f"`{json.dumps(field['default'])}`"
+        default = (
+            "required" if name in required else "" if field.get("default") in (None, "") else f"`{json.dumps(field['default'])}`"
+        )
         meaning = field.get("description") or MEANINGS.get(name, "")
         if name == "kind":
             meaning = "which kind this is"
@@ -235,14 +241,14 @@ def fields_table(schema: dict[str, Any]) -> str:
 def kind_reference() -> str:
     """Every field of every kind: type, default, meaning, example."""
     definitions = constraint_schema()["$defs"]
-    parts = []
+    parts, own = [], {cls.__name__ for _, cls in kind_classes()}
     for kind, cls in kind_classes():
-        lead, rest = lead_and_rest(cls.__doc__ or "")
-        parts += [f"### `{kind}`", in_cell(lead)]
-        parts += [f"```text\n{rest}\n```"] if rest else []
-        parts += [f"```yaml\n- {checked_example(kind)}\n```", fields_table(definitions[cls.__name__])]
-        for name in sorted(nested_models(definitions[cls.__name__], definitions) - {c.__name__ for _, c in kind_classes()}):
-            parts += [f"`{name}`: {in_cell(lead_and_rest(definitions[name].get('description', ''))[0])}", fields_table(definitions[name])]
+        schema, (first, rest) = definitions[cls.__name__], lead_and_rest(cls.__doc__ or "")
+        parts += [f"### `{kind}`", in_cell(first), *([f"```text\n{rest}\n```"] if rest else [])]
+        parts += [f"```yaml\n- {checked_example(kind)}\n```", fields_table(schema)]
+        for name in sorted(nested_models(schema, definitions) - own):
+            first, _ = lead_and_rest(definitions[name].get("description", ""))
+            parts += [f"`{name}`: {in_cell(first)}", fields_table(definitions[name])]
     return "\n\n".join(parts)
 
 
@@ -294,7 +300,7 @@ def command_help() -> str:
 # --- Programs --------------------------------------------------------------------------------------------------------
 
 
-class MissingProgram(Exception):
+class MissingProgramError(Exception):
     """A page shows a program that tests/api/ does not have."""
 
 
@@ -302,7 +308,7 @@ def program(name: str) -> str:
     """The program tests/api/NAME.py as the test suite runs it."""
     path = PROGRAMS / f"{name}.py"
     if not path.is_file():
-        raise MissingProgram(f"{path.relative_to(ROOT)} does not exist; its block was left as it is")
+        raise MissingProgramError(f"{path.relative_to(ROOT)} does not exist; its block was left as it is")
     return f"```python\n{path.read_text().strip()}\n```"
 
 
@@ -323,13 +329,13 @@ BLOCKS: dict[str, Callable[[], str]] = {
 def filled(text: str, missing: list[str] | None = None) -> str:
     """The text with every marked block made anew.
 
-    missing   collects a message for each block that cannot be made, which then stays as it is; None: raise MissingProgram
+    missing   collects a message for each block that cannot be made, which then stays as it is; None: raise MissingProgramError
     """
 
     def made(block: re.Match[str]) -> str:
         try:
             return f"{block[1]}{BLOCKS[block[2]]()}\n{block[3]}"
-        except MissingProgram as error:
+        except MissingProgramError as error:
             if missing is None:
                 raise
             missing.append(str(error))

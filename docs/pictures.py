@@ -33,7 +33,9 @@ SIZE = {"dpi": 110, "bbox_inches": "tight"}
 def disc(dim: int, radius: float = 1.0) -> Ellipsoid:
     """Outside a disc around the origin of the first two coordinates."""
     which = torch.eye(dim, dtype=torch.float64)[:2]
-    return Ellipsoid(which, torch.zeros(2, dtype=torch.float64), torch.full((2,), radius, dtype=torch.float64), torch.tensor(radius), 1)
+    return Ellipsoid(
+        which, torch.zeros(2, dtype=torch.float64), torch.full((2,), radius, dtype=torch.float64), torch.tensor(radius), 1
+    )
 
 
 def ends(x: torch.Tensor) -> Pins:
@@ -73,7 +75,7 @@ def segments_picture() -> None:
     bare(right, "safe on the segments: both ends of each in its half-space")
     for axes in (left, right):
         axes.set_xlim(-2.4, 2.4)
-        axes.set_ylim(-1.2, 1.9)
+        axes.set_ylim(-1.2, 2.3)
         axes.legend(fontsize=8, loc="upper left")
     figure.tight_layout()
     figure.savefig(FOLDER / "segments.png", **SIZE)
@@ -105,7 +107,8 @@ def dynamics_picture(dt: float = 0.1, bound: float = 3.0, horizon: int = 48) -> 
         needed = wanted[1:].abs().amax(1) if name != "with dynamics" else dynamics.inputs(x)[0, 1:].abs().amax(1)
         right.semilogy(times[1:], needed.clamp_min(1e-2), color=colour, lw=1.4)
     bare(left, f"past a disc, |acceleration| <= {bound:g} m/s² per axis")
-    left.legend(fontsize=8, loc="lower center")
+    left.set_ylim(-1.1, 2.0)
+    left.legend(fontsize=8, loc="upper left")
     right.axhline(bound, color="k", lw=0.8, ls="--")
     right.set_title("acceleration that each step needs (largest axis)", fontsize=10)
     right.set_xlabel("time / s")
@@ -117,10 +120,9 @@ def dynamics_picture(dt: float = 0.1, bound: float = 3.0, horizon: int = 48) -> 
 
 
 def margins_picture(episodes: int = 20, seed: int = 1000, level: float = 0.95) -> None:
-    """Hopper at its harder limit with no margin: `cdiff rollout --task hopper --method alm --margin 0 --episodes 20 --seed 1000`."""
-    options = Options(
-        task="hopper", method="alm", constraints=Path("constraints/hopper-hard.yaml"), n=episodes, seed=seed, margin=0.0, device="cpu"
-    )
+    """Hopper at its harder limit with no margin: `--margin 0`."""
+    file = Path("constraints/hopper-hard.yaml")
+    options = Options(task="hopper", method="alm", constraints=file, n=episodes, seed=seed, margin=0.0, device="cpu")
     acting = controller(resolve(options))
     done = control(acting, list(range(seed, seed + episodes)), {})
     executed = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
@@ -148,7 +150,8 @@ def margins_picture(episodes: int = 20, seed: int = 1000, level: float = 0.95) -
     figure.savefig(FOLDER / "margins.png", **SIZE)
     plt.close(figure)
     unsafe = (executed[:, 1:, part] > 1e-6).any(1).sum()
-    sys.stderr.write(f"margins: {unsafe} of {episodes} episodes exceed thigh-down; median error {np.median(scores):.4f}, margin {margin:.4f}\n")
+    sys.stderr.write(f"margins: {unsafe} of {episodes} episodes exceed thigh-down; ")
+    sys.stderr.write(f"median error {np.median(scores):.4f}, margin {margin:.4f}\n")
 
 
 if __name__ == "__main__":
