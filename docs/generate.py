@@ -193,7 +193,7 @@ def kinds_table() -> str:
 
 
 def in_cell(text: str) -> str:
-    return text.replace("|", "&#124;").replace("<", "&lt;")
+    return re.sub(r"<(?=\w)", "&lt;", text.replace("|", "&#124;"))
 
 
 def type_of(field: dict[str, Any]) -> str:
