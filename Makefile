@@ -3,10 +3,11 @@ BIN := .venv/bin
 CALIBRATE := rollout --calibrate --level 0.99 --episodes 100 --seed 5000
 SLALOM := --constraints constraints/maze2d-umaze-slalom.yaml
 
-export OMP_WAIT_POLICY ?= PASSIVE  # threads that wait do not spin: two test processes share the cores
+# Threads that wait do not spin: several processes share the cores.
+export OMP_WAIT_POLICY ?= PASSIVE
 export GOMP_SPINCOUNT ?= 0
 
-.PHONY: demo test lint tables benchmark oracle experts margins clean
+.PHONY: demo test lint pages docs benchmark oracle experts margins clean
 
 demo: .venv/.ready  ## plan on the shipped model with every method, compare
 	$(BIN)/cdiff plan --method diffuser $(SLALOM) --runs runs/demo --json >/dev/null
@@ -23,8 +24,11 @@ lint: .venv/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-tables: .venv/.ready  ## the tables of README.md and docs/results.md from runs/reference
-	$(BIN)/python tests/readme_tables.py
+pages: .venv/.ready  ## the generated blocks of README.md and docs/: results, constraint kinds, commands, programs
+	$(BIN)/python docs/generate.py
+
+docs: .venv/.ready  ## the documentation site, into .site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -f docs/site/mkdocs.yml
 
 benchmark: .venv/.ready  ## timings, as ratios within one run
 	$(BIN)/python tests/benchmarks/speed/constraint_share.py
@@ -49,4 +53,4 @@ margins: .venv/.ready  ## calibrate the margins of models/*/small.margins.yaml a
 	touch $@
 
 clean:
-	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .site .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -46,7 +46,12 @@ def half_log_snr(alpha_bar: float) -> float:
 
 
 def langevin(
-    x: Traj, x0: Traj, z: Traj, a: float, b: float, previous: Previous | None = None
+    x: Traj,
+    x0: Traj,
+    z: Traj,
+    a: float,
+    b: float,
+    previous: Previous | None = None,  # noqa: ARG001
 ) -> Traj:
     """x_{t-1} = x_t + (beta_t / 2) score + sqrt(beta_t) z (paper, Eq. 8), score by Eq. 7. It is not the step that samples
     a trained model: see the known-answer tests.

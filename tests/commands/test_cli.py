@@ -1,8 +1,6 @@
 """The command line as typed: exit codes, content, what is on disk afterwards."""
 
 import json
-import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -462,24 +460,3 @@ def test_every_recipe_is_valid_and_every_preset_makes_its_methods(task):
     for preset in recipe.presets.values():
         for name, settings in preset.methods.items():
             make_method(name, settings)
-
-
-def readme_commands():
-    text = (ROOT / "README.md").read_text()
-    blocks = re.findall(r"```bash\n(.*?)```", text, re.S)
-    return [
-        line.split("  #")[0].strip()
-        for block in blocks
-        for line in block.splitlines()
-        if line.startswith("cdiff ")
-    ]
-
-
-@pytest.mark.parametrize("command", readme_commands())
-def test_each_readme_command_parses(command):
-    """Every option and value of a README command is known: the same line with --help is accepted, its files exist."""
-    words = shlex.split(command)[1:]
-    cdiff(*words, "--help")
-    for word in words:
-        if word.endswith(".yaml"):
-            assert (ROOT / word).exists() or "mine" in word
