@@ -181,9 +181,9 @@ def train(
     plan = load_recipe(task)
     condition = None
     if conditional is not None:
-        from cdiff_cli.training.labels import Condition
+        from cdiff_cli.training.labels import ConstraintLabel
 
-        condition = Condition.read(conditional, problem)
+        condition = ConstraintLabel.read(conditional, problem)
     recipe = recipe or ("conditional" if condition else "small")
     name = f"conditional-{condition.name}" if condition else recipe
     work = runs / f"train-{task}-{name}-{seed}"
@@ -222,10 +222,10 @@ def options(values: dict[str, Any]) -> Any:
     """The Options of plan and rollout from a command's local variables."""
     from dataclasses import fields
 
-    from cdiff_cli.commands.resolve import Options
+    from cdiff_cli.commands.resolve import Request
 
     values = values | {name: tuple(values.get(name) or ()) for name in ("settings", "env")}
-    return Options(**{f.name: values[f.name] for f in fields(Options) if f.name in values})
+    return Request(**{f.name: values[f.name] for f in fields(Request) if f.name in values})
 
 
 def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
@@ -545,6 +545,6 @@ def check(
         raise CdiffError(
             "name a constraint file, as in `cdiff check constraints/maze2d-umaze.yaml`, or ask for --schema"
         )
-    from cdiff_cli.commands.check import explain
+    from cdiff_cli.commands.check import check
 
-    explain(file, picture or RUNS / f"check-{file.stem}.png", out)
+    check(file, picture or RUNS / f"check-{file.stem}.png", out)

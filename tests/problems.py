@@ -8,16 +8,16 @@ import qpsolvers
 import torch
 from scipy.optimize import nnls
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.black_box import Opaque
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.black_box import BlackBox
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.spec.load import load_constraints
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Quadric
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import SpecError
 from cdiff_cli.projection.project import project
-from cdiff_cli.projection.solvers.isotonic import _nearest_between
+from cdiff_cli.projection.solvers.isotonic import nearest_between
 from cdiff_cli.sampling.sampler import Step
 
 LAYOUT = ("x", "y", "vx", "vy")
@@ -44,7 +44,7 @@ def normal(seed, *shape, scale=1.0):
 
 
 def half_space(a=(1.0, -1.0), b=0.2):
-    return Affine(vec(*a), num(b))
+    return HalfSpace(vec(*a), num(b))
 
 
 def ball(side, centre=(0.3, -0.2), radius=0.7, dim=None):
@@ -82,15 +82,15 @@ LEVELS = {
 
 
 def waypoints(level, name="w"):
-    return Constraint((Waypoints(name, level),))
+    return Constraint((AtWaypoints(name, level),))
 
 
 def chain(level, alpha, name="c"):
-    return Constraint((Chain(name, level, alpha),))
+    return Constraint((DiscreteBarrier(name, level, alpha),))
 
 
 def opaque(fn, name="o"):
-    return Constraint((Opaque(name, fn, lambda horizon: horizon),))
+    return Constraint((BlackBox(name, fn, lambda horizon: horizon),))
 
 
 KINDS = {
@@ -98,7 +98,11 @@ KINDS = {
     **{f"dcbf over {name}": chain(level, 0.3) for name, level in LEVELS.items()},
     "opaque": opaque(lambda x: (x**3).sum(-1) - 0.5),
     "stack": Constraint(
-        (Waypoints("a", half_space()), Chain("b", ball(1), 0.4), Waypoints("e", ellipsoid(-1)))
+        (
+            AtWaypoints("a", half_space()),
+            DiscreteBarrier("b", ball(1), 0.4),
+            AtWaypoints("e", ellipsoid(-1)),
+        )
     ),
 }
 
@@ -158,7 +162,7 @@ def nearest_of(points, z):
 # samplers with known answers ------------------------------------------------------------------------------------------
 
 UNIT_MEAN_SHIFT = waypoints(
-    Affine(vec(-1.0), num(-1.0))
+    HalfSpace(vec(-1.0), num(-1.0))
 )  # g(x) = 1 - x: E x >= 1 turns N(0, 1) into N(1, 1), lam* = 1
 
 
@@ -201,7 +205,7 @@ def nearest_chain(h, gamma, weight, fixed):
     """The nearest chain as projection/barrier.py finds it, v_k = h_k where fixed [n]: a first and a last run of indices."""
     free = torch.nonzero(~fixed)[:, 0]
     first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
-    return _nearest_between(h, gamma, weight, first, last)
+    return nearest_between(h, gamma, weight, first, last)
 
 
 def free_projection(g, z):

@@ -8,7 +8,7 @@ import numpy as np
 from cdiff_cli.arrays import Array
 from cdiff_cli.commands.margins import Calibration, Margin, write_calibration
 from cdiff_cli.commands.plan import Tick
-from cdiff_cli.commands.resolve import Resolved
+from cdiff_cli.commands.resolve import Experiment
 from cdiff_cli.commands.rollout import _diverged, controller, parse_env
 from cdiff_cli.constraints.spec.load import kinds_sha256
 from cdiff_cli.errors import CdiffError
@@ -18,14 +18,14 @@ from cdiff_cli.paths import shown
 from cdiff_cli.planning.receding_horizon import control
 
 
-def calibrate(resolved: Resolved, tick: Tick, level: float) -> tuple[Path, Calibration]:
+def calibrate(resolved: Experiment, tick: Tick, level: float) -> tuple[Path, Calibration]:
     """Fit margins to what was asked for, and write them beside the checkpoint."""
     assert resolved.checkpoint is not None
     found = fit_margins(resolved, tick, level)
     return write_calibration(resolved.checkpoint.path, found), found
 
 
-def fit_margins(resolved: Resolved, tick: Tick, level: float) -> Calibration:
+def fit_margins(resolved: Experiment, tick: Tick, level: float) -> Calibration:
     """Margins that cover how far execution leaves the plans that keep them; each pass acts on the next n seeds."""
     n, checkpoint = resolved.options.n, resolved.checkpoint
     require_enough(n, level)

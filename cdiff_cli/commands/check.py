@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cdiff_cli.constraints.dynamics import Reachable
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
 from cdiff_cli.constraints.observed import Observed
-from cdiff_cli.constraints.rate import Rate
+from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.load import load_constraints
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.evaluation.figures import plans as plan_figures
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.recipe import load_recipe
@@ -22,7 +22,7 @@ from cdiff_cli.tasks import load_task
 from cdiff_cli.yaml_files import Document
 
 
-def explain(file: Path, picture: Path, out: Console) -> None:
+def check(file: Path, picture: Path, out: Console) -> None:
     """Print the constraints of a file: rows, coordinates, units, projection, share of demonstrations that satisfy them; draw
     them over those demonstrations.
     """
@@ -93,10 +93,10 @@ def explain(file: Path, picture: Path, out: Console) -> None:
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
 
 
-def _projection(form: Part) -> str:
+def _projection(form: TrajectoryConstraint) -> str:
     """How the nearest trajectory that obeys it is found (project.py)."""
-    if isinstance(form, Reachable):
+    if isinstance(form, LinearDynamicsConstraint):
         return "active set"
-    if isinstance(form, Rate):
+    if isinstance(form, RateLimit):
         return "ADMM"
     return "exact" if has_exact_form(form) else "sequential (ProxQP)"

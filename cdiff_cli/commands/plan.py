@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.commands.resolve import Resolved
+from cdiff_cli.commands.resolve import Experiment
 from cdiff_cli.commands.run_directory import new_run, write_rows, write_yaml
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation import metrics
@@ -45,7 +45,7 @@ class Finished:
 
 
 def plan_run(
-    resolved: Resolved, root: Path, tick: Tick, *, name: str | None = None, pictures: bool = True
+    resolved: Experiment, root: Path, tick: Tick, *, name: str | None = None, pictures: bool = True
 ) -> Finished:
     """Plan, measure, write runs/<stamp>-plan-.../, or <stamp>-<name>"""
     name_of_task = resolved.problem.task.name
@@ -73,7 +73,7 @@ def plan_run(
     )
 
 
-def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
+def _plan_both(resolved: Experiment, tick: Tick) -> tuple[Plans, Plans]:
     """The asked plans, and the unconstrained ones of the same noise."""
     calls = resolved.problem.schedule.n_steps
     free = plan(
@@ -99,7 +99,7 @@ def _plan_both(resolved: Resolved, tick: Tick) -> tuple[Plans, Plans]:
     return replace(plans, calls=resolved.calls_a_step * plans.calls), free
 
 
-def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
+def _plan_rows(resolved: Experiment, plans: Plans, free: Plans) -> list[Row]:
     task, n = resolved.problem.task, len(plans.x)
     units = resolved.recipe.paper_units
     measured = metrics.plan_metrics(task, resolved.problem.g, plans.x, free.x, units)
@@ -127,7 +127,7 @@ def _plan_rows(resolved: Resolved, plans: Plans, free: Plans) -> list[Row]:
 
 
 def _write_plans(
-    path: Path, resolved: Resolved, plans: Plans, free: Plans, rows: list[Row]
+    path: Path, resolved: Experiment, plans: Plans, free: Plans, rows: list[Row]
 ) -> None:
     write_yaml(
         path / "run.yaml",
@@ -165,7 +165,7 @@ def _write_plans(
 
 
 def _write_certificate(
-    path: Path, resolved: Resolved, planned: Array, executed: Array | None = None
+    path: Path, resolved: Experiment, planned: Array, executed: Array | None = None
 ) -> dict[str, int | None]:
     """certificate.json of the arrays already written; its counts."""
 
@@ -181,7 +181,7 @@ def _write_certificate(
     return proof["counts"]
 
 
-def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) -> None:
+def _plan_pictures(path: Path, resolved: Experiment, plans: Plans, free: Plans) -> None:
     task, options = resolved.problem.task, resolved.options
     title = f"{task.name}, {options.method} ({options.preset}), n = {len(plans.x)}"
     x_free = None if isinstance(resolved.method, Unconstrained) else free.x
@@ -190,7 +190,7 @@ def _plan_pictures(path: Path, resolved: Resolved, plans: Plans, free: Plans) ->
     plan_figures.convergence_picture(path / "convergence.png", traces)
 
 
-def _chain_figure(path: Path, resolved: Resolved, plans: Plans) -> str:
+def _chain_figure(path: Path, resolved: Experiment, plans: Plans) -> str:
     """Figure 1 and its number: the share of samples that sit on the boundary, beside the true constrained law's."""
     task, g, within = cast(Any, resolved.problem.task), resolved.problem.g, 0.05
     assert plans.chain is not None
@@ -206,6 +206,6 @@ def _chain_figure(path: Path, resolved: Resolved, plans: Plans) -> str:
     )
 
 
-def _name(command: str, resolved: Resolved) -> str:
+def _name(command: str, resolved: Experiment) -> str:
     options = resolved.options
     return f"{command}-{options.task}-{options.method}-{options.preset}"

@@ -11,8 +11,8 @@ import torch
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.commands.margins import Chosen, Conditions, choose, read_calibrations
-from cdiff_cli.constraints.dynamics import Reachable, dynamics_of
-from cdiff_cli.constraints.rate import Rate
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of
+from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.kinds import DYNAMICS_TOLERANCE
 from cdiff_cli.constraints.spec.load import Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
@@ -20,7 +20,7 @@ from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.evaluation.conformal import tightened
 from cdiff_cli.machine import choose_device
 from cdiff_cli.models.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.models.denoiser import Denoiser, Seeing, calls_a_step, guided
+from cdiff_cli.models.denoiser import Denoiser, ObservingDenoiser, calls_a_step, guided
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.recipe import Preset, Recipe, load_recipe
 from cdiff_cli.models.schedule import Schedule
@@ -36,7 +36,7 @@ from cdiff_cli.tasks.protocol import Task
 
 
 @dataclass(frozen=True)
-class Options:
+class Request:
     """What the user asked for; None is the task's own default."""
 
     task: str = "maze2d-umaze"
@@ -65,10 +65,10 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Resolved:
+class Experiment:
     """Everything a command needs, checked."""
 
-    options: Options
+    options: Request
     recipe: Recipe
     preset: Preset
     kernel: str
@@ -88,7 +88,7 @@ class Resolved:
         return None if self.conditional is None else self._guided(self.conditional, None)
 
     @property
-    def seeing(self) -> Seeing | None:
+    def seeing(self) -> ObservingDenoiser | None:
         """The same of a planner that is told what it observes; None of the others."""
         planner = self.conditional
         if planner is None or (telling := planner.telling) is None:
@@ -180,7 +180,7 @@ class Resolved:
     def calibration_command(self) -> str:
         """The command that fits margins to what was asked for."""
         flags = {"settings": "--set", "steps": "--steps", "env": "--env"}
-        asked, default = asdict(self.options), asdict(Options())
+        asked, default = asdict(self.options), asdict(Request())
         words = [
             "cdiff rollout --calibrate --level 0.99 --episodes 100 --seed 5000",
             f"--task {self.options.task}",
@@ -199,7 +199,7 @@ class Resolved:
         )
 
 
-def resolve(options: Options) -> Resolved:
+def resolve(options: Request) -> Experiment:
     """Read and check all that the options name; raises a CdiffError before anything is computed or written."""
     task = load_task(options.task)
     if options.n < 1:
@@ -254,7 +254,7 @@ def resolve(options: Options) -> Resolved:
     kinds, g = load_constraints(
         path, task.name, task.layout, fitted, observable, getattr(task, "dt", None)
     )
-    limited = [part.name for part in g.parts if isinstance(part, Rate)]
+    limited = [part.name for part in g.parts if isinstance(part, RateLimit)]
     if limited and recipe.frame == "relative":
         raise CdiffError(
             f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out'
@@ -292,7 +292,7 @@ def resolve(options: Options) -> Resolved:
     )
     check_feasible(problem)
     conditioned = _conditional(kinds, path, checkpoint) if isinstance(method, Conditional) else None
-    return Resolved(
+    return Experiment(
         options,
         recipe,
         preset,
@@ -310,7 +310,7 @@ def resolve(options: Options) -> Resolved:
 
 
 def _conditions(
-    options: Options,
+    options: Request,
     preset: Preset,
     settings: dict[str, Any],
     kernel: str,
@@ -337,7 +337,7 @@ def _conditions(
 
 
 def _margins(
-    options: Options,
+    options: Request,
     preset: Preset,
     method: Method,
     g: Constraint,
@@ -360,11 +360,11 @@ def _margins(
     return choose(known, checkpoint.card.weights_sha256, path.stem, kinds_sha256(kinds), conditions)
 
 
-def _require_applicable(options: Options, acts: bool) -> None:
+def _require_applicable(options: Request, acts: bool) -> None:
     """Refuse options that would be ignored: those of whole plans on a control task, those of control on another."""
     whole = ("start", "goal", "random", "no_dynamics")
     control = ("execute", "warm", "margin", "action_noise", "env", "calibrate")
-    default = Options()
+    default = Request()
     for name in whole if acts else control:
         if getattr(options, name) != getattr(default, name):
             flag = "--" + name.replace("_", "-")
@@ -417,13 +417,17 @@ def _obeyed(
     parts = enforced(kinds, g, preset.safety).parts
     dynamics = checkpoint.dynamics if checkpoint else None
     if preset.dynamics and dynamics is not None and not dynamics_of(g):
-        parts = (*parts, Reachable.of("dynamics", dynamics, DYNAMICS_TOLERANCE))
+        parts = (
+            *parts,
+            LinearDynamicsConstraint.from_dynamics("dynamics", dynamics, DYNAMICS_TOLERANCE),
+        )
     slow = task.tolerances.velocity_weight
     weight = torch.tensor(
         [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
     )
     parts = tuple(
-        replace(part, weight=weight) if isinstance(part, Reachable) else part for part in parts
+        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
+        for part in parts
     )
     unchanged = len(parts) == len(g.parts) and all(
         part is declared for part, declared in zip(parts, g.parts, strict=True)
@@ -431,7 +435,7 @@ def _obeyed(
     return g if unchanged else Constraint(parts)
 
 
-def needed_speed(resolved: Resolved) -> tuple[float, float] | None:
+def needed_speed(resolved: Experiment) -> tuple[float, float] | None:
     """(mean speed the shortest way asks for, 95 % of the data's windows stay below), m/s; None where it has no meaning."""
     problem, task = resolved.problem, resolved.problem.task
     if (

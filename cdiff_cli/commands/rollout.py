@@ -20,7 +20,7 @@ from cdiff_cli.commands.plan import (
     _write_certificate,
     _write_plans,
 )
-from cdiff_cli.commands.resolve import Resolved
+from cdiff_cli.commands.resolve import Experiment
 from cdiff_cli.commands.run_directory import new_run, write_rows, write_yaml
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.evaluation import metrics
@@ -38,7 +38,7 @@ from cdiff_cli.tasks.protocol import ControlTask
 
 
 def control_run(
-    resolved: Resolved,
+    resolved: Experiment,
     root: Path,
     tick: Tick,
     video: str | None = None,
@@ -97,7 +97,7 @@ def _diverged(done: Episodes) -> str:
     return f"{int(done.diverged.sum())} of {len(done.x)} episodes diverged (a plan or a state was no longer finite) and were stopped"
 
 
-def controller(resolved: Resolved) -> Controller:
+def controller(resolved: Experiment) -> Controller:
     """What acting needs."""
     problem, preset, options, checkpoint = (
         resolved.problem,
@@ -171,7 +171,7 @@ def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:
     return found
 
 
-def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -> list[Row]:
+def _rows(resolved: Experiment, acting: Controller, done: Episodes, levels: Any) -> list[Row]:
     space = acting.task.make_env().action_space
     measured = metrics.control_metrics(
         done, levels, (space.low.astype(float), space.high.astype(float))
@@ -187,7 +187,7 @@ def _rows(resolved: Resolved, acting: Controller, done: Episodes, levels: Any) -
 
 
 def _write(
-    path: Path, resolved: Resolved, acting: Controller, done: Episodes, rows: list[Row]
+    path: Path, resolved: Experiment, acting: Controller, done: Episodes, rows: list[Row]
 ) -> None:
     about = {
         "command": ["cdiff", *sys.argv[1:]],
@@ -216,7 +216,7 @@ def _write(
 
 
 def rollout_run(
-    resolved: Resolved,
+    resolved: Experiment,
     root: Path,
     tick: Tick,
     video: str | None = None,
@@ -261,7 +261,7 @@ def rollout_run(
     )
 
 
-def _write_rollout(path: Path, resolved: Resolved, done: Rollout) -> None:
+def _write_rollout(path: Path, resolved: Experiment, done: Rollout) -> None:
     layout = np.array(resolved.problem.task.layout)
     arrays: Any = asdict(done) | {"layout": layout, "seed": np.array(resolved.seeds)}
     np.savez_compressed(path / "rollout.npz", **arrays)

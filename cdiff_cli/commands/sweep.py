@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.run_directory import find_rows, read_rows
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.evaluation.columns import Row
@@ -51,7 +51,7 @@ class Job:
     group   task, constraints, method and preset
     """
 
-    options: Options
+    options: Request
     rollout: bool
     group: tuple[str, ...]
     name: str
@@ -109,7 +109,7 @@ def _jobs(
     matrix: Matrix, task: str, constraints: Path | None, preset: str, method: str
 ) -> Iterator[Job | Outcome]:
     kind = "rollout" if matrix.rollout else "plan"
-    asked = Options(
+    asked = Request(
         task=task,
         method=method,
         preset=preset,
@@ -133,7 +133,7 @@ def _jobs(
     except CdiffError as found:
         error = str(found)
     for seed in matrix.seeds:
-        options = Options(**(vars(asked) | {"seed": seed}))
+        options = Request(**(vars(asked) | {"seed": seed}))
         job = Job(
             options,
             matrix.rollout,

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.segments import _segments
-from cdiff_cli.constraints.state_sets import Level, is_affine, moved, take
-from cdiff_cli.constraints.trajectory import Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.segments import keep_on_segments
+from cdiff_cli.constraints.state_sets import StateSet, converted, is_affine, selected
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 
 
 @dataclass(frozen=True)
-class Chain:
+class DiscreteBarrier:
     """Discrete control barrier function h = -f:  (1 - alpha) h(x^tau) - h(x^{tau+1}) <= 0 (paper, section 5.1).
 
     level    whose barrier is to stay non-negative
@@ -24,10 +24,10 @@ class Chain:
     """
 
     name: str
-    level: Level
+    level: StateSet
     alpha: float
     alpha2: float | None = None
-    ahead: Level | None = None
+    ahead: StateSet | None = None
 
     spans = True
 
@@ -36,7 +36,7 @@ class Chain:
         return is_affine(self.acting)
 
     @property
-    def acting(self) -> Level:
+    def acting(self) -> StateSet:
         """The level that the rows are of."""
         return self.level if self.ahead is None else self.ahead
 
@@ -75,42 +75,42 @@ class Chain:
                 spread[:, k : k + n] += weight * w
             return spread[..., None] * slope
 
-        size = level.size(x)
+        size = level.step_bound(x)
         largest = size[:, :n]
         for k in range(1, len(c)):
             largest = torch.maximum(largest, size[:, k : k + n])
         return self(x), pull, sum(abs(weight) for weight in c) ** 2 * largest
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Chain":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "DiscreteBarrier":
         return self._each(lambda level: level.pull_back(centre, scale))
 
-    def take(self, which: Tensor) -> "Chain":
-        return self._each(lambda level: take(level, which))
+    def select(self, which: Tensor) -> "DiscreteBarrier":
+        return self._each(lambda level: selected(level, which))
 
-    def to(self, like: Tensor) -> "Chain":
-        return self._each(lambda level: moved(level, like))
+    def to(self, like: Tensor) -> "DiscreteBarrier":
+        return self._each(lambda level: converted(level, like))
 
-    def shift(self, margin: float) -> "Chain":
+    def tighten(self, margin: float) -> "DiscreteBarrier":
         """g <= -margin is the same chain over h - margin / alpha, or / (alpha alpha2)."""
-        return self.shift_level(margin / sum(self.coefficients))
+        return self.tighten_level(margin / sum(self.coefficients))
 
-    def shift_level(self, margin: float) -> "Chain":
-        return self._each(lambda level: level.shift(margin))
+    def tighten_level(self, margin: float) -> "DiscreteBarrier":
+        return self._each(lambda level: level.tighten(margin))
 
-    def _each(self, change: Callable[[Level], Level]) -> "Chain":
+    def _each(self, change: Callable[[StateSet], StateSet]) -> "DiscreteBarrier":
         return replace(
             self, level=change(self.level), ahead=None if self.ahead is None else change(self.ahead)
         )
 
     def segment_max(self, x: Traj) -> Rows:
         """-h between waypoints: the barrier itself, which is what the chain keeps non-negative."""
-        return Waypoints(self.name, self.level).segment_max(x)
+        return AtWaypoints(self.name, self.level).segment_max(x)
 
     def state_values(self, x: Traj) -> Rows:
         return self.level(x)
 
-    def on_segments(self) -> "tuple[Part, ...]":
+    def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         """The chain, and its barrier on the segments where the chain does not give it."""
         if not self.level.convex:
-            return (self, _segments(self.name, self.level))
-        return (self,) if self.ahead is None else (self, Waypoints(self.name, self.level))
+            return (self, keep_on_segments(self.name, self.level))
+        return (self,) if self.ahead is None else (self, AtWaypoints(self.name, self.level))

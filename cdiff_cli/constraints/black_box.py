@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import take
-from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.state_sets import selected
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 
 
 @dataclass(frozen=True)
-class Opaque:
+class BlackBox:
     """Rows of which only the function is known: differentiated by autograd, projected by sequential linearisation.
 
     fn             trajectory in environment units -> rows, differentiable
@@ -51,21 +51,21 @@ class Opaque:
         size = pull(torch.ones_like(rows)).square().sum((1, 2))
         return rows.detach(), pull, size[:, None].expand_as(rows)
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Opaque":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "BlackBox":
         if self.centre is None or self.scale is None:
             return replace(self, centre=centre, scale=scale)
         return replace(self, centre=self.centre + self.scale * centre, scale=self.scale * scale)
 
-    def take(self, which: Tensor) -> "Opaque":
-        return take(self, which)
+    def select(self, which: Tensor) -> "BlackBox":
+        return selected(self, which)
 
-    def to(self, like: Tensor) -> "Opaque":
+    def to(self, like: Tensor) -> "BlackBox":
         return self
 
-    def shift(self, margin: float) -> "Opaque":
+    def tighten(self, margin: float) -> "BlackBox":
         return replace(self, margin=self.margin + margin)
 
-    shift_level = shift
+    tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
         return self(x)
@@ -73,6 +73,6 @@ class Opaque:
     def state_values(self, x: Traj) -> Rows:
         return self(x).amax(1, keepdim=True).expand(x.shape[:2])
 
-    def on_segments(self) -> "tuple[Part, ...]":
+    def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         """Nothing is known of it between the waypoints."""
         return (self,)

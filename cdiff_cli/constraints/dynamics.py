@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj, each_end
-from cdiff_cli.constraints.state_sets import take
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.state_sets import selected
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class LinearDynamics:
 
 
 @dataclass(frozen=True, eq=False)
-class Reachable:
+class LinearDynamicsConstraint:
     """Each step is one that the dynamics can make: |x' - A x - B u - c| <= tolerance for some u within its bounds. A row a step.
 
     dynamics       environment units
@@ -77,7 +77,9 @@ class Reachable:
     affine = False  # rows are absolute values
 
     @classmethod
-    def of(cls, name: str, dynamics: LinearDynamics, tolerance: float) -> "Reachable":
+    def from_dynamics(
+        cls, name: str, dynamics: LinearDynamics, tolerance: float
+    ) -> "LinearDynamicsConstraint":
         """Of trajectories in environment units, every coordinate weighing 1."""
         one = torch.ones_like(dynamics.c)
         return cls(name, dynamics, torch.zeros_like(one), one, one, tolerance)
@@ -110,22 +112,22 @@ class Reachable:
 
         return length - self.tolerance, pull, 2 * (back.square().sum(-1) + on.square().sum(-1))
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Reachable":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "LinearDynamicsConstraint":
         return replace(self, centre=self.centre + self.scale * centre, scale=self.scale * scale)
 
-    def take(self, which: Tensor) -> "Reachable":
-        return take(self, which)
+    def select(self, which: Tensor) -> "LinearDynamicsConstraint":
+        return selected(self, which)
 
-    def to(self, like: Tensor) -> "Reachable":
+    def to(self, like: Tensor) -> "LinearDynamicsConstraint":
         moved = {
             name: getattr(self, name).to(like) for name in ("dynamics", "centre", "scale", "weight")
         }
         return replace(self, **moved)
 
-    def shift(self, margin: float) -> "Reachable":
+    def tighten(self, margin: float) -> "LinearDynamicsConstraint":
         return replace(self, tolerance=self.tolerance - margin)
 
-    shift_level = shift
+    tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
         """A step's own row."""
@@ -134,13 +136,13 @@ class Reachable:
     def state_values(self, x: Traj) -> Rows:
         return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
 
-    def on_segments(self) -> tuple[Part, ...]:
+    def on_segments(self) -> tuple[TrajectoryConstraint, ...]:
         return (self,)
 
 
-def dynamics_of(g: Constraint) -> list[Reachable]:
+def dynamics_of(g: Constraint) -> list[LinearDynamicsConstraint]:
     """The parts that ask for dynamics to be obeyed."""
-    return [part for part in g.parts if isinstance(part, Reachable)]
+    return [part for part in g.parts if isinstance(part, LinearDynamicsConstraint)]
 
 
 def split(g: Constraint) -> tuple[Constraint, Constraint]:

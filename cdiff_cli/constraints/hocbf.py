@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import times
-from cdiff_cli.constraints.state_sets import Between, Ellipsoid
+from cdiff_cli.constraints.state_sets import Ellipsoid, SegmentPoints
 
 NEAREST = 1e-9  # of a distance to the centre, so that the centre itself has a normal
 
 
 @dataclass(frozen=True)
-class Approach:
+class BallHOCBF:
     """f = -psi,  psi = h + time dh/dt,  h = |y| - radius  with y = which x - centre, and dh/dt = (y / |y|).w, w = rates x - drift.
 
     psi >= 0 all along gives h(t) >= h(0) e^(-t / time): a path that starts outside never enters (a control barrier function of
@@ -54,10 +54,10 @@ class Approach:
             self.time * normal, self.rates
         )
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         return self.gradient(x).square().sum(-1)
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Approach":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "BallHOCBF":
         return replace(
             self,
             which=self.which * scale[..., None, :],
@@ -66,18 +66,18 @@ class Approach:
             drift=self.drift - times(centre, self.rates.mT),
         )
 
-    def shift(self, margin: float) -> "Approach":
+    def tighten(self, margin: float) -> "BallHOCBF":
         return replace(self, radius=self.radius + margin)
 
-    def worst(self, x: Tensor) -> Tensor:
+    def segment_argmax(self, x: Tensor) -> Tensor:
         """The worse end of each segment: nothing more is known of it between them."""
         f = self(x)
         return (f[..., 1:] > f[..., :-1]).to(x)
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         f, slope = self(x), self.gradient(x)
         back, on = (1 - s)[..., None] * slope[..., :-1, :], s[..., None] * slope[..., 1:, :]
-        return Between(
+        return SegmentPoints(
             torch.lerp(f[..., :-1], f[..., 1:], s),
             back,
             on,
@@ -85,11 +85,11 @@ class Approach:
         )
 
 
-def approached(ball: Ellipsoid, later: Tensor, led: Tensor, time: float) -> Approach:
+def second_order(ball: Ellipsoid, later: Tensor, led: Tensor, time: float) -> BallHOCBF:
     """The barrier of a ball that states keep outside of.
 
     later   where its centre will be `time` seconds on    [..., k]
     led     the state `time` seconds on is led x          [dim, dim]
     """
     rates = ball.which @ (led - torch.eye(len(led), dtype=led.dtype, device=led.device)) / time
-    return Approach(ball.which, ball.centre, rates, (later - ball.centre) / time, ball.m, time)
+    return BallHOCBF(ball.which, ball.centre, rates, (later - ball.centre) / time, ball.m, time)

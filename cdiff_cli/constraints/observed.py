@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import Level
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.state_sets import StateSet
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.errors import CdiffError
 
-Seen = Mapping[str, Tensor]
+ObservedValues = Mapping[str, Tensor]
 """Observed quantities by name, each [batch]."""
 
 
@@ -27,13 +27,15 @@ class Observed:
 
     name: str
     names: tuple[str, ...]
-    make: Callable[[Seen, float, int], Part]
-    changes: tuple[Callable[[Part], Sequence[Part]], ...] = ()
+    make: Callable[[ObservedValues, float, int], TrajectoryConstraint]
+    changes: tuple[Callable[[TrajectoryConstraint], Sequence[TrajectoryConstraint]], ...] = ()
 
     spans = True
     affine = False
 
-    def bind(self, observed: Seen, dt: float, horizon: int) -> tuple[Part, ...]:
+    def bind(
+        self, observed: ObservedValues, dt: float, horizon: int
+    ) -> tuple[TrajectoryConstraint, ...]:
         """The part, filled in; CdiffError where a quantity is missing."""
         missing = [name for name in self.names if name not in observed]
         if missing:
@@ -41,12 +43,12 @@ class Observed:
             raise CdiffError(
                 f'the constraint "{self.name}" observes {", ".join(missing)}; what is observed here is {offered}'
             )
-        parts: Sequence[Part] = (self.make(observed, dt, horizon),)
+        parts: Sequence[TrajectoryConstraint] = (self.make(observed, dt, horizon),)
         for change in self.changes:
             parts = [new for part in parts for new in change(part)]
         return tuple(parts)
 
-    def example(self, horizon: int) -> tuple[Part, ...]:
+    def example(self, horizon: int) -> tuple[TrajectoryConstraint, ...]:
         """The part as it is where every quantity is 1: its form, not its numbers."""
         return self.bind(
             {name: torch.ones(1, dtype=torch.float64) for name in self.names}, 1.0, horizon
@@ -58,22 +60,24 @@ class Observed:
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Observed":
         return self._then(lambda part: (part.pull_back(centre, scale),))
 
-    def take(self, which: Tensor) -> "Observed":
-        return self._then(lambda part: (part.take(which),))
+    def select(self, which: Tensor) -> "Observed":
+        return self._then(lambda part: (part.select(which),))
 
     def to(self, like: Tensor) -> "Observed":
         return self._then(lambda part: (part.to(like),))
 
-    def shift(self, margin: float) -> "Observed":
-        return self._then(lambda part: (part.shift(margin),))
+    def tighten(self, margin: float) -> "Observed":
+        return self._then(lambda part: (part.tighten(margin),))
 
-    def shift_level(self, margin: float) -> "Observed":
-        return self._then(lambda part: (part.shift_level(margin),))
+    def tighten_level(self, margin: float) -> "Observed":
+        return self._then(lambda part: (part.tighten_level(margin),))
 
     def on_segments(self) -> "tuple[Observed, ...]":
         return (self._then(lambda part: part.on_segments()),)
 
-    def _then(self, change: Callable[[Part], Sequence[Part]]) -> "Observed":
+    def _then(
+        self, change: Callable[[TrajectoryConstraint], Sequence[TrajectoryConstraint]]
+    ) -> "Observed":
         return replace(self, changes=(*self.changes, change))
 
     def __call__(self, x: Traj) -> Rows:
@@ -102,7 +106,9 @@ def require_bound(g: Constraint) -> None:
             part.refuse()
 
 
-def carried(level: Level, velocity: Tensor, dt: float, horizon: int, ahead: float = 0.0) -> Level:
+def carried(
+    level: StateSet, velocity: Tensor, dt: float, horizon: int, ahead: float = 0.0
+) -> StateSet:
     """The level moving at a velocity [dim] or [batch, 1, dim]: at waypoint k it stands where k dt + ahead of it have brought it."""
     way = velocity * (ahead + dt * torch.arange(horizon, dtype=velocity.dtype))[:, None]
     return level.pull_back(-way, velocity.new_ones(velocity.shape[-1]))

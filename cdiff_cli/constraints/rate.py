@@ -14,13 +14,13 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj, each_end
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import take
-from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.state_sets import selected
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.errors import InfeasibleError
 
 
 @dataclass(frozen=True, eq=False)
-class Rate:
+class RateLimit:
     """A limit on the rate of change of some coordinates from each waypoint to the next. A row a segment, in their units a second.
 
     norm           whether g = |rate| - high, else g = max(rate - high, low - rate) of a single coordinate
@@ -80,16 +80,16 @@ class Rate:
 
         return self._excess(rate), pull, 2 * (back.square().sum(-1) + on.square().sum(-1))
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Rate":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "RateLimit":
         return replace(self, centre=self.centre + self.scale * centre, scale=self.scale * scale)
 
-    def take(self, which: Tensor) -> "Rate":
-        return take(self, which)
+    def select(self, which: Tensor) -> "RateLimit":
+        return selected(self, which)
 
-    def to(self, like: Tensor) -> "Rate":
+    def to(self, like: Tensor) -> "RateLimit":
         return replace(self, **{name: getattr(self, name).to(like) for name in self.trailing})
 
-    def shift(self, margin: float) -> "Rate":
+    def tighten(self, margin: float) -> "RateLimit":
         low, high = self.low + margin, self.high - margin
         if high < (0.0 if self.norm else low):
             raise InfeasibleError(
@@ -97,7 +97,7 @@ class Rate:
             )
         return replace(self, low=low, high=high)
 
-    shift_level = shift
+    tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
         """A segment's own row: along it the rate does not change."""
@@ -106,7 +106,7 @@ class Rate:
     def state_values(self, x: Traj) -> Rows:
         return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
 
-    def on_segments(self) -> tuple[Part, ...]:
+    def on_segments(self) -> tuple[TrajectoryConstraint, ...]:
         return (self,)
 
     def cut(self, change: Tensor) -> Tensor:
@@ -134,7 +134,7 @@ class Rate:
                 )
 
 
-def refuse_contradiction(parts: Sequence[Rate]) -> None:
+def refuse_contradiction(parts: Sequence[RateLimit]) -> None:
     """Limits that no change meets together: of each coordinate the slowest change that those of it alone allow is the easiest for
     the limits of lengths.
     """
@@ -159,6 +159,6 @@ def _contradict(one: str, other: str) -> None:
     )
 
 
-def limits(low: float | None, high: float | None) -> tuple[float, float]:
+def rate_bounds(low: float | None, high: float | None) -> tuple[float, float]:
     """Bounds, infinite where not given."""
     return (-math.inf if low is None else low), (math.inf if high is None else high)

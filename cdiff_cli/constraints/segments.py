@@ -6,16 +6,23 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import Framed, Level, Quadric, moved, segment_max, take
-from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.state_sets import (
+    Quadric,
+    QuadricInFrame,
+    StateSet,
+    converted,
+    segment_max,
+    selected,
+)
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 
 
 @dataclass(frozen=True)
-class Segments:
+class OnSegments:
     """f <= 0 all along the straight segments between waypoints: one row a segment, its largest f."""
 
     name: str
-    level: Level
+    level: StateSet
 
     spans = True
     affine = False
@@ -27,7 +34,7 @@ class Segments:
         return self.segment_max(x)[:, : x.shape[1] - 1]
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        at = self.level.between(x, self.level.worst(x))
+        at = self.level.on_segment(x, self.level.segment_argmax(x))
 
         def pull(w: Rows) -> Traj:
             out = torch.zeros_like(x)
@@ -37,19 +44,19 @@ class Segments:
 
         return at.value, pull, 2 * at.size
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Segments":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "OnSegments":
         return replace(self, level=self.level.pull_back(centre, scale))
 
-    def take(self, which: Tensor) -> "Segments":
-        return replace(self, level=take(self.level, which))
+    def select(self, which: Tensor) -> "OnSegments":
+        return replace(self, level=selected(self.level, which))
 
-    def to(self, like: Tensor) -> "Segments":
-        return replace(self, level=moved(self.level, like))
+    def to(self, like: Tensor) -> "OnSegments":
+        return replace(self, level=converted(self.level, like))
 
-    def shift(self, margin: float) -> "Segments":
-        return replace(self, level=self.level.shift(margin))
+    def tighten(self, margin: float) -> "OnSegments":
+        return replace(self, level=self.level.tighten(margin))
 
-    shift_level = shift
+    tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
         return segment_max(self.level, x) if x.shape[1] > 1 else self.level(x)
@@ -57,11 +64,11 @@ class Segments:
     def state_values(self, x: Traj) -> Rows:
         return self.level(x)
 
-    def on_segments(self) -> "tuple[Part, ...]":
+    def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         return (self,)
 
 
-def _segments(name: str, level: Level) -> Segments:
+def keep_on_segments(name: str, level: StateSet) -> OnSegments:
     """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
-    ball = level.ball() if isinstance(level, Quadric | Framed) else None
-    return Segments(name, ball or level)
+    ball = level.ball() if isinstance(level, Quadric | QuadricInFrame) else None
+    return OnSegments(name, ball or level)

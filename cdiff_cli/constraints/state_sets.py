@@ -19,12 +19,12 @@ from cdiff_cli.errors import InfeasibleError
 L = TypeVar("L")
 
 
-class Between(NamedTuple):
+class SegmentPoints(NamedTuple):
     """A level at one point of each segment of a trajectory [..., horizon, dim].
 
     value      f there                                                        [..., horizon - 1]
     back, on   its derivatives by the segment's first and last waypoint       [..., horizon - 1, dim]
-    size       |back|^2 + |on|^2, plus |f| times the curvature (Level.size)   [..., horizon - 1]
+    size       |back|^2 + |on|^2, plus |f| times the curvature (StateSet.step_bound)   [..., horizon - 1]
     """
 
     value: Tensor
@@ -33,7 +33,7 @@ class Between(NamedTuple):
     size: Tensor
 
 
-class Level(Protocol):
+class StateSet(Protocol):
     """A scalar function f of a state [..., dim], allowed where f <= 0, in environment units even after pull_back."""
 
     def __call__(self, x: Tensor) -> Tensor: ...
@@ -41,25 +41,25 @@ class Level(Protocol):
         """df/dx [..., dim]."""
         ...
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         """|df/dx|^2 [...], plus |f| times the largest curvature, so that f / size is a safe step where the gradient fades."""
         ...
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Level":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "StateSet":
         """f(centre + scale * z) as a function of z; centre and scale [dim], or with [horizon] or [batch | 1, horizon] in front."""
         ...
 
-    def shift(self, margin: float) -> "Level":
+    def tighten(self, margin: float) -> "StateSet":
         """A level allowed exactly where f <= -margin."""
         ...
 
-    def worst(self, x: Tensor) -> Tensor:
+    def segment_argmax(self, x: Tensor) -> Tensor:
         """Where f is largest on the segments of trajectories [..., horizon, dim], exactly: the share s in [0, 1] of each segment
         that lies before it [..., horizon - 1]. Where the level differs from waypoint to waypoint, it moves evenly between them.
         """
         ...
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         """The level at the share s of each segment."""
         ...
 
@@ -70,7 +70,7 @@ class Level(Protocol):
 
 
 @dataclass(frozen=True)
-class Affine:
+class HalfSpace:
     """f(x) = a.x - b.   a [dim], b scalar, in the units of a.x"""
 
     a: Tensor
@@ -85,26 +85,26 @@ class Affine:
     def gradient(self, x: Tensor) -> Tensor:
         return self.a.expand_as(x)
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         return self.a.square().sum(-1).expand(x.shape[:-1])
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Affine":
-        return Affine(self.a * scale, self.b - dot(centre, self.a))
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "HalfSpace":
+        return HalfSpace(self.a * scale, self.b - dot(centre, self.a))
 
-    def through(self, led: Tensor) -> "Affine":
+    def compose(self, led: Tensor) -> "HalfSpace":
         """f(led x)   led [dim, dim]"""
         return replace(self, a=self.a @ led)
 
-    def shift(self, margin: float) -> "Affine":
+    def tighten(self, margin: float) -> "HalfSpace":
         return replace(self, b=self.b - margin)
 
-    def worst(self, x: Tensor) -> Tensor:
+    def segment_argmax(self, x: Tensor) -> Tensor:
         return _last_end(self(x), x)
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         f, (first, last) = self(x), each_end(self.a, 1)
         back, on = (1 - s)[..., None] * first, s[..., None] * last
-        return Between(
+        return SegmentPoints(
             torch.lerp(f[..., :-1], f[..., 1:], s),
             back,
             on,
@@ -128,7 +128,7 @@ class Quadric:
     def gradient(self, x: Tensor) -> Tensor:
         return 2 * times(x, self.P) + self.q
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         return self.gradient(x).square().sum(-1) + self.curvature * self(x).abs()
 
     @property
@@ -136,31 +136,34 @@ class Quadric:
         """A bound of |d2f/dx2|."""
         return 2 * torch.linalg.matrix_norm(self.P)
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Quadric | Framed":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "Quadric | QuadricInFrame":
         if max(centre.ndim, scale.ndim) > 1:
-            return Framed(self, centre, scale)
+            return QuadricInFrame(self, centre, scale)
         q = scale * (2 * times(centre, self.P) + self.q)
         return Quadric(scale[:, None] * self.P * scale, q, -self(centre))
 
-    def shift(self, margin: float) -> "Quadric":
+    def tighten(self, margin: float) -> "Quadric":
         return replace(self, r=self.r - margin)
 
     @property
     def convex(self) -> bool:
         return bool((torch.linalg.eigvalsh(self.P)[..., 0] >= 0).all())
 
-    def worst(self, x: Tensor) -> Tensor:
+    def segment_argmax(self, x: Tensor) -> Tensor:
         x0, d = x[..., :-1, :], x.diff(dim=-2)
         curvature, slope = (times(d, self.P) * d).sum(-1), (self.gradient(x0) * d).sum(-1)
         end = (slope + curvature > 0).to(x)  # the larger of both ends
         return torch.where(curvature < 0, (-slope / (2 * curvature)).clamp(0.0, 1.0), end)
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         share = s[..., None]
         at = x[..., :-1, :] + share * x.diff(dim=-2)
         slope = self.gradient(at)
-        return Between(
-            self(at), (1 - share) * slope, share * slope, ((1 - s) ** 2 + s**2) * self.size(at)
+        return SegmentPoints(
+            self(at),
+            (1 - share) * slope,
+            share * slope,
+            ((1 - s) ** 2 + s**2) * self.step_bound(at),
         )
 
     def ball(self) -> "Ellipsoid | None":
@@ -188,7 +191,7 @@ class Quadric:
 
 
 @dataclass(frozen=True)
-class Framed:
+class QuadricInFrame:
     """A quadric that each plan and waypoint sees from a frame of its own: f(x) = quadric(centre + scale * x).
 
     The frame is kept rather than multiplied out: a segment is straight in the quadric's coordinates, not in those of x.
@@ -210,30 +213,30 @@ class Framed:
     def gradient(self, x: Tensor) -> Tensor:
         return self.scale * self.quadric.gradient(self.seen(x))
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         bend = self.quadric.curvature * self.scale.square().amax(-1)
         return self.gradient(x).square().sum(-1) + bend * self(x).abs()
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Framed":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "QuadricInFrame":
         return replace(self, centre=self.seen(centre), scale=self.scale * scale)
 
-    def shift(self, margin: float) -> "Framed":
-        return replace(self, quadric=self.quadric.shift(margin))
+    def tighten(self, margin: float) -> "QuadricInFrame":
+        return replace(self, quadric=self.quadric.tighten(margin))
 
     @property
     def convex(self) -> bool:
         return self.quadric.convex
 
-    def worst(self, x: Tensor) -> Tensor:
-        return self.quadric.worst(self.seen(x))
+    def segment_argmax(self, x: Tensor) -> Tensor:
+        return self.quadric.segment_argmax(self.seen(x))
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
-        there, (first, last) = self.quadric.between(self.seen(x), s), each_end(self.scale, 1)
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
+        there, (first, last) = self.quadric.on_segment(self.seen(x), s), each_end(self.scale, 1)
         back, on = there.back * first, there.on * last
         bend = self.quadric.curvature * torch.maximum(
             first.square().amax(-1), last.square().amax(-1)
         )
-        return Between(
+        return SegmentPoints(
             there.value,
             back,
             on,
@@ -288,7 +291,7 @@ class Ellipsoid:
         """df/dy [..., k]."""
         return -self.side * m[..., None] * (y / y.norm(dim=-1, keepdim=True).clamp_min(1e-12))
 
-    def size(self, x: Tensor) -> Tensor:
+    def step_bound(self, x: Tensor) -> Tensor:
         return self.gradient(x).square().sum(-1)
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> "Ellipsoid":
@@ -304,7 +307,7 @@ class Ellipsoid:
         s = scale @ self.which.T
         return replace(self, centre=(self.centre - centre @ self.which.T) / s, axes=self.axes / s)
 
-    def through(self, led: Tensor) -> "Ellipsoid":
+    def compose(self, led: Tensor) -> "Ellipsoid":
         """f(led x)   led [dim, dim], which leaves the rows of `which` without a coordinate in common"""
         which = self.which @ led
         s = which.norm(dim=-1)
@@ -312,7 +315,7 @@ class Ellipsoid:
             self, which=which / s[:, None], centre=self.centre / s, axes=self.axes / s, mixed=True
         )
 
-    def shift(self, margin: float) -> "Ellipsoid":
+    def tighten(self, margin: float) -> "Ellipsoid":
         grown = 1 + self.side * margin / self.m
         if self.side < 0 and bool((grown <= 0).any()):
             size = float(self.m.min())
@@ -325,14 +328,14 @@ class Ellipsoid:
     def convex(self) -> bool:
         return self.side < 0
 
-    def worst(self, x: Tensor) -> Tensor:
+    def segment_argmax(self, x: Tensor) -> Tensor:
         if self.side < 0:
             return _last_end(self(x), x)
         y = self.scaled(x)
         d = y.diff(dim=-2)
         return (-(y[..., :-1, :] * d).sum(-1) / d.square().sum(-1).clamp_min(1e-30)).clamp(0.0, 1.0)
 
-    def between(self, x: Tensor, s: Tensor) -> Between:
+    def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         y, m = self.scaled(x), each_end(self.m, 0)[0]
         share, (first, last), (to, there) = (
             s[..., None],
@@ -343,7 +346,7 @@ class Ellipsoid:
         slope = self._slope(at, m)
         back, on = (1 - share) * slope / first, share * slope / last
         value = self.side * m * (1 - at.norm(dim=-1))
-        return Between(
+        return SegmentPoints(
             value, times(back, to), times(on, there), back.square().sum(-1) + on.square().sum(-1)
         )
 
@@ -359,24 +362,24 @@ class Ellipsoid:
         return Quadric(-self.side * weight @ self.which, -self.side * q, r)
 
 
-def is_affine(level: Level) -> bool:
+def is_affine(level: StateSet) -> bool:
     """Whether f is affine, and the same function for every plan and waypoint."""
-    return isinstance(level, Affine) and level.a.ndim == 1
+    return isinstance(level, HalfSpace) and level.a.ndim == 1
 
 
-def segment_max(level: Level, x: Tensor) -> Tensor:
+def segment_max(level: StateSet, x: Tensor) -> Tensor:
     """The largest f on the segments of trajectories [..., horizon, dim], exactly [..., horizon - 1]."""
     f = level(x)
     at_ends = torch.maximum(f[..., :-1], f[..., 1:])  # so that rounding never hides an unsafe end
-    return torch.maximum(at_ends, level.between(x, level.worst(x)).value)
+    return torch.maximum(at_ends, level.on_segment(x, level.segment_argmax(x)).value)
 
 
-def moved(level: L, like: Tensor) -> L:
+def converted(level: L, like: Tensor) -> L:
     """The level with its numbers in the dtype and on the device of `like`."""
     return _mapped(level, lambda _, value: value.to(like))
 
 
-def take(level: L, which: Tensor) -> L:
+def selected(level: L, which: Tensor) -> L:
     """The level of some plans of the batch alone."""
 
     def some(trailing: int, value: Tensor) -> Tensor:

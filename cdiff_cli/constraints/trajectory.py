@@ -18,7 +18,7 @@ from cdiff_cli.arrays import Pull, Rows, Traj
 from cdiff_cli.constraints.affine_rows import AffineRows
 
 
-class Part(Protocol):
+class TrajectoryConstraint(Protocol):
     """Some rows of a constraint."""
 
     @property
@@ -43,7 +43,7 @@ class Part(Protocol):
         """The same part of z, x = centre + scale * z; the rows keep their values and units."""
         ...
 
-    def take(self, which: Tensor) -> Self:
+    def select(self, which: Tensor) -> Self:
         """The same part of some plans of the batch alone."""
         ...
 
@@ -51,11 +51,11 @@ class Part(Protocol):
         """The same part with its numbers in the dtype and on the device of `like`."""
         ...
 
-    def shift(self, margin: float) -> Self:
+    def tighten(self, margin: float) -> Self:
         """g <= -margin."""
         ...
 
-    def shift_level(self, margin: float) -> Self:
+    def tighten_level(self, margin: float) -> Self:
         """The level tightened to f <= -margin, a barrier to h >= margin; of a part without a level, g."""
         ...
 
@@ -69,7 +69,7 @@ class Part(Protocol):
         """
         ...
 
-    def on_segments(self) -> "tuple[Part, ...]":
+    def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         """The parts that hold all along the segments, as far as the part's form allows; itself where they need no more."""
         ...
 
@@ -78,7 +78,9 @@ class Part(Protocol):
 class Bindable(Protocol):
     """A part that waits for observed quantities (observed.py)."""
 
-    def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> tuple[Part, ...]: ...
+    def bind(
+        self, observed: Mapping[str, Tensor], dt: float, horizon: int
+    ) -> tuple[TrajectoryConstraint, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Constraint:
     condensed   the rows of all parts at once, where they are affine and someone has written them so (`condense`)
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[TrajectoryConstraint, ...]
     condensed: AffineRows | None = None
 
     @cached_property
@@ -168,11 +170,11 @@ class Constraint:
 
     def tighten(self, margin: float) -> "Constraint":
         """The constraint g <= -margin (margin in the units of g)."""
-        return Constraint(tuple(part.shift(margin) for part in self.parts))
+        return Constraint(tuple(part.tighten(margin) for part in self.parts))
 
-    def take(self, which: Tensor) -> "Constraint":
+    def select(self, which: Tensor) -> "Constraint":
         """The same constraint of some plans of the batch alone."""
-        return Constraint(tuple(part.take(which) for part in self.parts))
+        return Constraint(tuple(part.select(which) for part in self.parts))
 
     def to(self, like: Tensor) -> "Constraint":
         """The same constraint with its numbers in the dtype and on the device of `like`."""

@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.segments import _segments
-from cdiff_cli.constraints.state_sets import Level, is_affine, moved, segment_max, take
-from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.segments import keep_on_segments
+from cdiff_cli.constraints.state_sets import StateSet, converted, is_affine, segment_max, selected
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 
 
 @dataclass(frozen=True)
-class Waypoints:
+class AtWaypoints:
     """f(x^tau) <= 0 at every waypoint: one row a waypoint."""
 
     name: str
-    level: Level
+    level: StateSet
 
     spans = True
 
@@ -31,21 +31,21 @@ class Waypoints:
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
         slope = self.level.gradient(x)
-        return self.level(x), lambda w: w[..., None] * slope, self.level.size(x)
+        return self.level(x), lambda w: w[..., None] * slope, self.level.step_bound(x)
 
-    def pull_back(self, centre: Tensor, scale: Tensor) -> "Waypoints":
+    def pull_back(self, centre: Tensor, scale: Tensor) -> "AtWaypoints":
         return replace(self, level=self.level.pull_back(centre, scale))
 
-    def take(self, which: Tensor) -> "Waypoints":
-        return replace(self, level=take(self.level, which))
+    def select(self, which: Tensor) -> "AtWaypoints":
+        return replace(self, level=selected(self.level, which))
 
-    def to(self, like: Tensor) -> "Waypoints":
-        return replace(self, level=moved(self.level, like))
+    def to(self, like: Tensor) -> "AtWaypoints":
+        return replace(self, level=converted(self.level, like))
 
-    def shift(self, margin: float) -> "Waypoints":
-        return replace(self, level=self.level.shift(margin))
+    def tighten(self, margin: float) -> "AtWaypoints":
+        return replace(self, level=self.level.tighten(margin))
 
-    shift_level = shift
+    tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
         if x.shape[1] < 2:
@@ -55,5 +55,5 @@ class Waypoints:
     def state_values(self, x: Traj) -> Rows:
         return self.level(x)
 
-    def on_segments(self) -> "tuple[Part, ...]":
-        return (self if self.level.convex else _segments(self.name, self.level),)
+    def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
+        return (self if self.level.convex else keep_on_segments(self.name, self.level),)

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import Rate
-from cdiff_cli.constraints.state_sets import Level
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.state_sets import StateSet
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.tasks.protocol import Task
 
 Entry = dict[str, Any]
@@ -136,7 +136,7 @@ def _counts(entries: Sequence[Entry], n: int, parts: int, executed: bool) -> dic
     }
 
 
-def _at_waypoints(part: Part, x: Array, task: Task) -> list[Entry]:
+def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
     """The worst row of each plan: its label, the waypoint tau it judges (of a step, the one it leads to), the state there."""
     rows, labels = _values(part(_tensor(x))), part.labels(x.shape[1])
     found = []
@@ -161,14 +161,14 @@ def _at_waypoints(part: Part, x: Array, task: Task) -> list[Entry]:
     return found
 
 
-def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
+def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
     """The worst value on the straight segments between the waypoints of each plan, and the first point that has it.
 
-    A part over a level has the exact maximum (Level.worst), one that asks nothing between waypoints its own values, a rate is the
+    A part over a level has the exact maximum (StateSet.segment_argmax), one that asks nothing between waypoints its own values, a rate is the
     same all along a segment, whose beginning is named; of any other it is only what was found, and no promise.
     """
-    level: Level | None = getattr(part, "level", None)
-    steady = isinstance(part, Rate)
+    level: StateSet | None = getattr(part, "level", None)
+    steady = isinstance(part, RateLimit)
     exact = level is not None or steady or not part.spans
     rows = _values(part.segment_max(_tensor(x)))
     at = [_first_worst(values) for values in rows]
@@ -180,7 +180,7 @@ def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
         share = (
             np.zeros(len(x))
             if level is None
-            else level.worst(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
+            else level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
         )
         point = begin + share[:, None] * (end - begin)
         places = [
@@ -195,7 +195,7 @@ def _on_segments(part: Part, x: Array, task: Task) -> list[Entry]:
     ]
 
 
-def _executed(part: Part, rollout: Saved | None, task: Task) -> list[Entry]:
+def _executed(part: TrajectoryConstraint, rollout: Saved | None, task: Task) -> list[Entry]:
     """The worst row over the executed states of each episode, up to its end."""
     if rollout is None:
         return []
@@ -223,7 +223,9 @@ def _first_worst(values: Array) -> int | None:
     return int(((values >= largest - TIE) & ((values > 0) == (largest > 0))).argmax())
 
 
-def _waypoint(part: Part, label: str, row: int, rows: int, horizon: int) -> int | None:
+def _waypoint(
+    part: TrajectoryConstraint, label: str, row: int, rows: int, horizon: int
+) -> int | None:
     """The waypoint of a row by its label, name@tau or name@tau-tau'; None where the rows are not one a waypoint or step."""
     step = re.search(r"@\d+-(\d+)$", label)
     if step is not None:

@@ -19,7 +19,7 @@ class Cell:
     interval: Interval | None = None
 
     @classmethod
-    def of(cls, values: Sequence[float], interval: Interval | None = None) -> "Cell":
+    def from_values(cls, values: Sequence[float], interval: Interval | None = None) -> "Cell":
         n = len(values)
         finite = all(map(math.isfinite, values))
         error = statistics.stdev(values) / math.sqrt(n) if n > 1 and finite else math.nan
@@ -79,7 +79,7 @@ def compare(
             Group(
                 key,
                 len(mine),
-                {name: Cell.of(v, bounds.get(name)) for name, v in values.items() if v},
+                {name: Cell.from_values(v, bounds.get(name)) for name, v in values.items() if v},
             )
         )
     return groups

@@ -19,7 +19,7 @@ def tightened(g: Constraint, margins: Mapping[str, float]) -> Constraint:
         return g
     return Constraint(
         tuple(
-            part.shift_level(margins.get(part.name, 0.0)) if part.name in margins else part
+            part.tighten_level(margins.get(part.name, 0.0)) if part.name in margins else part
             for part in g.parts
         )
     )

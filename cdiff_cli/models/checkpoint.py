@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.errors import CheckpointError
-from cdiff_cli.models.denoiser import Telling
+from cdiff_cli.models.denoiser import ObservationEncoder
 from cdiff_cli.models.networks import InverseDynamics, ResidualMlp, TemporalUnet
-from cdiff_cli.models.normaliser import Frame, Normaliser
+from cdiff_cli.models.normaliser import Normaliser, ResidualNormaliser
 from cdiff_cli.models.recipe import Card, MlpSpec, NetworkSpec
 from cdiff_cli.paths import home, shown
 
@@ -41,9 +41,9 @@ class Checkpoint:
     card: Card
     path: Path
     dynamics: LinearDynamics | None = None
-    frame: Frame | None = None
+    frame: ResidualNormaliser | None = None
     inverse: InverseDynamics | None = None
-    telling: Telling | None = None
+    telling: ObservationEncoder | None = None
 
     @property
     def limit(self) -> float:
@@ -156,9 +156,9 @@ def load_checkpoint(
         card,
         path,
         dynamics,
-        Frame(normaliser, **parts["frame"]) if "frame" in parts else None,
+        ResidualNormaliser(normaliser, **parts["frame"]) if "frame" in parts else None,
         _inverse(parts["inverse"], device) if "inverse" in parts else None,
-        Telling(**parts["telling"]) if "telling" in parts else None,
+        ObservationEncoder(**parts["telling"]) if "telling" in parts else None,
     )
 
 

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor, nn
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.observed import Seen
+from cdiff_cli.constraints.observed import ObservedValues
 
 LEAST = 1e-6  # scale of a quantity that is the same throughout
 
 
 @dataclass(frozen=True)
-class Telling:
+class ObservationEncoder:
     """How observed quantities are told to a network: those called after a coordinate (obstacle.x, after x) relative to it as it is
     at present, all of them in standard deviations.
 
@@ -28,7 +28,7 @@ class Telling:
     @classmethod
     def fit(
         cls, names: Sequence[str], layout: Sequence[str], seen: Sequence[Tensor], present: Tensor
-    ) -> "Telling":
+    ) -> "ObservationEncoder":
         """The scales of the data: quantities, in order, each [n], and the states [n, dim] that they were seen from."""
         last = [name.rpartition(".")[2] for name in names]
         columns = torch.tensor([layout.index(name) if name in layout else -1 for name in last])
@@ -48,7 +48,7 @@ def calls_a_step(weight: float) -> int:
 
 Denoiser = Callable[[Traj, int], Traj]
 """(x_t, t) -> clean estimate x0_hat, normalised coordinates."""
-Seeing = Callable[[Seen, Tensor], Denoiser]
+ObservingDenoiser = Callable[[ObservedValues, Tensor], Denoiser]
 """(what is observed now, the present states [n, dim]) -> the clean estimate of a planner that is told of it."""
 
 

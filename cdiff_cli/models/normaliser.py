@@ -49,7 +49,7 @@ class Normaliser:
 
 
 @dataclass(frozen=True)
-class Frame:
+class ResidualNormaliser:
     """x^0 = state.centre + state.scale z^0,  x^k = x^0 + mean^k + gain^k z^0 + scale^k z^k for k > 0.
 
     The first row of z is the present state, which the network is told and never has to guess; the others say how the window

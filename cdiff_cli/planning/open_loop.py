@@ -210,7 +210,7 @@ def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array
     x, u = z.clone(), torch.zeros(len(z), z.shape[1] - 1, dynamics.B.shape[1], dtype=z.dtype)
     for clearance, tolerance in ((most, 5e-4), (most, 5e-5), (most, 5e-6), (TOUCHING, 5e-6)):
         inside = Constraint((reachable, *others.tighten(clearance).parts))
-        g = pull_back(inside, scale.centre, scale.scale).take(todo)
+        g = pull_back(inside, scale.centre, scale.scale).select(todo)
         pinned = pins.values[todo]
         warm = warm if clearance == most else None
         near, warm = project_reachable(g, z[todo], Pins(pins.mask, pinned), warm, tolerance)
@@ -224,5 +224,5 @@ def _follow_dynamics(problem: Problem, z: Traj, pins: Pins) -> tuple[Traj, Array
         x[todo[kept]], u[todo[kept]] = path[kept], made[kept]
         if not bool(wrong.any()):
             break
-        warm, todo = warm.of(wrong), todo[wrong]
+        warm, todo = warm.select(wrong), todo[wrong]
     return x, u.numpy()

@@ -8,7 +8,7 @@ import torch
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate, refuse_contradiction
+from cdiff_cli.constraints.rate import RateLimit, refuse_contradiction
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.denoiser import Denoiser
@@ -48,9 +48,9 @@ def check_feasible(problem: Problem) -> None:
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
             _check_pin(problem, name, state, columns)
-    refuse_contradiction([part for part in problem.g.parts if isinstance(part, Rate)])
+    refuse_contradiction([part for part in problem.g.parts if isinstance(part, RateLimit)])
     for part in problem.g.parts:
-        if isinstance(part, Rate) and problem.start is not None and problem.goal is not None:
+        if isinstance(part, RateLimit) and problem.start is not None and problem.goal is not None:
             pins = make_pins(
                 problem, len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu")
             )

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.affine_rows import AffineRows
-from cdiff_cli.constraints.observed import Seen
+from cdiff_cli.constraints.observed import ObservedValues
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.models.denoiser import Denoiser, Seeing
+from cdiff_cli.models.denoiser import Denoiser, ObservingDenoiser
 from cdiff_cli.models.networks import InverseDynamics
-from cdiff_cli.models.normaliser import Frame
+from cdiff_cli.models.normaliser import ResidualNormaliser
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.episodes import Episodes, Log
 from cdiff_cli.planning.problem import MARGIN
 from cdiff_cli.planning.timing import Timed, candidate_seed, synchronise
-from cdiff_cli.planning.warm_start import Resumed, moved_on
+from cdiff_cli.planning.warm_start import CarriedMultipliers, shift_plan
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling.baselines import BestOf
 from cdiff_cli.sampling.kernels import KERNELS
@@ -57,7 +57,7 @@ class Controller:
     task: ControlTask
     denoiser: Denoiser
     schedule: Schedule
-    frame: Frame
+    frame: ResidualNormaliser
     inverse: InverseDynamics
     g: Constraint
     enforced: Constraint
@@ -73,7 +73,7 @@ class Controller:
     resume: bool = False
     brake: Callable[[Array], Array] | None = None
     action_noise: float = 0.0
-    seeing: Seeing | None = None
+    seeing: ObservingDenoiser | None = None
     calls_a_step: int = 1
 
     @property
@@ -152,7 +152,7 @@ def control(
         )
         shift = 0 if controller.warm is None else controller.execute
         method, stuck, before = (
-            Resumed(controller.method, shift),
+            CarriedMultipliers(controller.method, shift),
             np.zeros(len(seeds), dtype=bool),
             alive,
         )
@@ -161,8 +161,10 @@ def control(
             if since == 0:
                 last = plans[alive] if tau and controller.warm is not None else None
                 goes_on = controller.resume or (last is not None and not controller.watchful)
-                method = Resumed(
-                    controller.method, shift, method.of(np.isin(before, alive)) if goes_on else None
+                method = CarriedMultipliers(
+                    controller.method,
+                    shift,
+                    method.select(np.isin(before, alive)) if goes_on else None,
                 )
                 before, draws = (
                     alive,
@@ -257,7 +259,7 @@ class _Asked(NamedTuple):
     last: Array | None
     draws: Tensor
 
-    def of(self, which: Any, draws: Tensor) -> "_Asked":
+    def select(self, which: Any, draws: Tensor) -> "_Asked":
         """The same of some of the episodes, or of each several times, with that noise."""
         seen = {name: values[which] for name, values in self.observed.items()}
         return _Asked(
@@ -265,7 +267,7 @@ class _Asked(NamedTuple):
         )
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> ObservedValues:
         return {name: torch.from_numpy(values) for name, values in self.observed.items()}
 
     def bind(self, g: Constraint, controller: Controller) -> Constraint:
@@ -297,7 +299,7 @@ def _apart(controller: Controller, asked: _Asked, groups: Sequence[NDArray[np.in
     """Plans made group by group, in the order of the episodes."""
     began = time.perf_counter()
     each = [
-        _plan(controller, controller.method, asked.of(group, asked.draws[group]))
+        _plan(controller, controller.method, asked.select(group, asked.draws[group]))
         for group in groups
     ]
     order = np.argsort(np.concatenate(groups))
@@ -319,7 +321,7 @@ def _apart(controller: Controller, asked: _Asked, groups: Sequence[NDArray[np.in
 def _best_of(controller: Controller, asked: _Asked) -> _Found:
     """Of `tries` unconstrained plans an episode the one with the least sum of [g]_+, g as enforced; the first among equals."""
     n, k = len(asked.states), controller.tries
-    many = asked.of(np.repeat(np.arange(n), k), asked.draws)
+    many = asked.select(np.repeat(np.arange(n), k), asked.draws)
     found = _plan_together(controller, Unconstrained(), many)
     unsafe = (
         many.bind(controller.enforced, controller)(torch.from_numpy(found.x))
@@ -363,7 +365,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
         begin = here[:, None] - to.centre
         schedule, first = controller.schedule, None
         noise = iter((scale * draws.to(device)).unbind(1))
-        on = None if last is None else moved_on(to, last, controller.execute)
+        on = None if last is None else shift_plan(to, last, controller.execute)
         if on is not None and controller.watchful:
             overtaken = (
                 (obeyed(torch.cat((here[:, None], (to.centre + on)[:, 1:]), 1)) > 0).any(1).numpy()

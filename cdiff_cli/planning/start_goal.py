@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import Rate
+from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.recipe import Card
@@ -48,7 +48,7 @@ def fastest(task: Any, g: Constraint) -> float:
     own = [
         part.high
         for part in g.parts
-        if isinstance(part, Rate) and part.norm and set(part.which.argmax(1).tolist()) == at
+        if isinstance(part, RateLimit) and part.norm and set(part.which.argmax(1).tolist()) == at
     ]
     return min(own, default=math.inf)
 

@@ -16,7 +16,7 @@ from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
 from cdiff_cli.sampling.sampler import Method, Step
 
 
-def moved_on(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
+def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
     """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
     reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
     """
@@ -26,8 +26,8 @@ def moved_on(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
 
 
 @dataclass
-class Resumed:
-    """The method, begun with the multipliers that the last plan ended with, moved on by `shift` waypoints: reset, they would have
+class CarriedMultipliers:
+    """The method, begun with the multipliers that the last plan ended with, moved on by `tighten` waypoints: reset, they would have
     to be found again in the few steps of a warm plan.
 
     state   of the method after its last step; None to begin anew
@@ -47,7 +47,7 @@ class Resumed:
         x, self.state = self.method.step(step, g, state)
         return x, self.state
 
-    def of(self, which: NDArray[np.bool_]) -> Any:
+    def select(self, which: NDArray[np.bool_]) -> Any:
         """The state of some of the episodes alone; multipliers that all share are theirs too."""
         state, some = self.state, torch.from_numpy(which)
         if isinstance(state, AlmState):

@@ -11,23 +11,23 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Rows, Traj, times
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.hocbf import Approach
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.hocbf import BallHOCBF
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
-from cdiff_cli.projection.solvers.isotonic import _nearest_between, _powers
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
+from cdiff_cli.projection.solvers.isotonic import nearest_between, powers
 from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
 
 LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
 NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
 
 
-def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
+def project_barrier(chain: DiscreteBarrier, z: Traj, pins: Pins) -> Traj:
     """The nearest trajectory to z with g <= 0; waypoints are pinned as a whole or not at all."""
     level = chain.acting
-    if isinstance(level, Approach):
+    if isinstance(level, BallHOCBF):
         return _by_linearising(chain, level, z, pins)
-    if isinstance(level, Affine):
+    if isinstance(level, HalfSpace):
         h, unit = -level(z), -level.a
         way = level.a.square().sum(-1).clamp_min(1e-30).rsqrt()
         low = None
@@ -47,7 +47,7 @@ def nearest_on_chain(chain: Chain, z: Traj, pins: Pins) -> Traj:
     return z + step[..., None] * unit
 
 
-def _by_linearising(chain: Chain, level: Approach, z: Traj, pins: Pins) -> Traj:
+def _by_linearising(chain: DiscreteBarrier, level: BallHOCBF, z: Traj, pins: Pins) -> Traj:
     """A nearest trajectory to z, by the exact projection onto the chain of the barriers linearised where the last one ended: each
     moves its waypoint along its gradient there. A local solution; what it ends on satisfies the chain to rounding.
     """
@@ -64,7 +64,9 @@ def _by_linearising(chain: Chain, level: Approach, z: Traj, pins: Pins) -> Traj:
     return x
 
 
-def _nearest_values(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins) -> Rows:
+def _nearest_values(
+    chain: DiscreteBarrier, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins
+) -> Rows:
     """The nearest values to h that the chain allows, those of held waypoints kept; none below `low`, which has the dimensions of
     a number of the level: h at the centre of a ball.
     """
@@ -72,7 +74,7 @@ def _nearest_values(chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, p
     if chain.alpha2 is not None:
         return _nearest_under(chain, h, weight, low, first, last)
     gamma = 1 - chain.alpha
-    target = _nearest_between(h, gamma, weight, first, last)
+    target = nearest_between(h, gamma, weight, first, last)
     by_waypoint = low is not None and low.ndim > 0 and low.shape[-1] > 1
     if low is not None and (first == 0 or by_waypoint):
         return torch.where(pins.held, target, torch.maximum(target, _lowest_chain(low, gamma, h)))
@@ -83,7 +85,7 @@ def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
     """The lowest chain whose values are nowhere below `low` [], [horizon | 1] or [batch | 1, horizon | 1]: v_k = max over i <= k of
     gamma^(k - i) low_i. A bound on the first index, which the chain hands on, exact where the balls are all of one size.
     """
-    power = _powers(gamma, h.shape[1] - 1, h)
+    power = powers(gamma, h.shape[1] - 1, h)
     if low.ndim == 0 or low.shape[-1] == 1:
         return power * low
     index = torch.arange(h.shape[1], device=h.device)
@@ -95,7 +97,7 @@ def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
 
 
 def _nearest_under(
-    chain: Chain, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int
+    chain: DiscreteBarrier, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int
 ) -> Rows:
     """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_dual). Where that asks for
     less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.

@@ -15,18 +15,18 @@ from torch import Tensor
 from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import HalfSpace
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.segments import NEVER, crossed, planes
-from cdiff_cli.projection.solvers.active_set import Bounds, settle
+from cdiff_cli.projection.solvers.active_set import Bounds, solve
 from cdiff_cli.projection.solvers.lq_tracking import tracking
 
 RHO, RELAXATION = 50.0, 1.6  # of ADMM, for what has a projection but no rows
 TURNS = (0, 10, 20, 40)  # its rounds before which the tangent planes are chosen anew
 
 
-class Warm(NamedTuple):
+class ActiveSetWarmStart(NamedTuple):
     """Where the last call ended: which rows were active (1 at their upper bound, -1 at their lower), the inputs, of ADMM
     copies and scaled multipliers, where it was needed, and which plans were soft.
 
@@ -39,14 +39,14 @@ class Warm(NamedTuple):
     push: Tensor
     soft: Tensor
 
-    def of(self, which: Tensor) -> "Warm":
+    def select(self, which: Tensor) -> "ActiveSetWarmStart":
         """Of some trajectories of the batch alone."""
-        return Warm(*(v[which] for v in self))
+        return ActiveSetWarmStart(*(v[which] for v in self))
 
 
-def nearest_reachable(
+def project_dynamics(
     dynamics: LinearDynamics,
-    parts: Sequence[Waypoints | Segments],
+    parts: Sequence[AtWaypoints | OnSegments],
     rest: Callable[[Traj, Pins], Traj] | None,
     z: Traj,
     pins: Pins,
@@ -55,9 +55,9 @@ def nearest_reachable(
     weight: Tensor,
     rounds: int,
     turns: int = 1,
-    warm: Warm | None = None,
+    warm: ActiveSetWarmStart | None = None,
     tolerance: float = 0.0,
-) -> tuple[Traj, Warm]:
+) -> tuple[Traj, ActiveSetWarmStart]:
     """The trajectory nearest to z, |x - z|^2 weighted by coordinate, that the dynamics produce from the first state of z under
     bounded inputs, with the parts (affine at waypoints, balls on segments) obeyed and a pinned last state reached.
 
@@ -77,7 +77,7 @@ def nearest_reachable(
             x.new_zeros(batch, horizon - 1, m),
             torch.zeros(batch, dtype=torch.bool, device=z.device),
         )
-        warm = Warm(active, u, held.values, torch.zeros_like(held.values), soft)
+        warm = ActiveSetWarmStart(active, u, held.values, torch.zeros_like(held.values), soft)
     if batch == 0 or horizon == 1:
         return z, warm
     heavy = tuple(v + RHO * (rest is not None and i in used) for i, v in enumerate(weight.tolist()))
@@ -96,7 +96,7 @@ def nearest_reachable(
         if bool(touched.any()):
             which = touched.nonzero()[:, 0]
             near = Pins(held.mask, held.values[which])
-            slope, bound = planes([part.take(which) for part in parts], at[which], near)
+            slope, bound = planes([part.select(which) for part in parts], at[which], near)
             a[which] = slope[:, 1:]
             b[which] = torch.where(free[:, None], bound[:, 1:], NEVER)
             walled = walled | touched
@@ -109,7 +109,7 @@ def nearest_reachable(
             walled.any()
         )  # rows a step: half-spaces only where some plan has them
         near_a, near_b = a[some, :, : each - m], b[some, :, : each - m]
-        w[some], active[some, :, :each], soft[some] = settle(
+        w[some], active[some, :, :each], soft[some] = solve(
             track, w0[some], rows, near_a, near_b, active[some, :, :each], soft[some]
         )
         at = torch.cat((held.values[:, :1], w[..., where]), 1)
@@ -127,12 +127,12 @@ def nearest_reachable(
         if not len(some):
             break
     out = torch.cat((x[:, :1], w[..., :n]), 1)
-    return out.to(z), Warm(active, w[..., n:], copy, push, soft)
+    return out.to(z), ActiveSetWarmStart(active, w[..., n:], copy, push, soft)
 
 
-def _slots(parts: Sequence[Waypoints | Segments]) -> int:
+def _slots(parts: Sequence[AtWaypoints | OnSegments]) -> int:
     """Half-spaces a waypoint that planes() makes of the parts."""
-    return sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
+    return sum(1 if isinstance(part.level, HalfSpace) else 2 for part in parts)
 
 
 def _toward(z: Tensor, weight: Tensor, pull: Tensor, used: list[int]) -> Tensor:

@@ -21,30 +21,30 @@ from typing import Any, cast
 import torch
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import dynamics_of, split
-from cdiff_cli.constraints.hocbf import Approach
+from cdiff_cli.constraints.hocbf import BallHOCBF
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Framed, Quadric
-from cdiff_cli.constraints.trajectory import Constraint, Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.projection.barrier import nearest_on_chain
+from cdiff_cli.projection.barrier import project_barrier
 from cdiff_cli.projection.dykstra import _dykstra
-from cdiff_cli.projection.dynamics import Warm, nearest_reachable
+from cdiff_cli.projection.dynamics import ActiveSetWarmStart, project_dynamics
 from cdiff_cli.projection.infeasible import _conflict, _refuse_pinned_violations, _worst_row
-from cdiff_cli.projection.rate import Slowed
+from cdiff_cli.projection.rate import RateProjection
 from cdiff_cli.projection.rate_dynamics import (
     bounds_only,
     limits_steps,
-    nearest_paced,
-    nearest_slowed,
+    project_rate_dynamics,
+    project_rates,
 )
-from cdiff_cli.projection.segments import crossed, goes_round, nearest_around
+from cdiff_cli.projection.segments import crossed, excludes_ellipsoid, nearest_around
 from cdiff_cli.projection.sequential_qp import _free_rows, _holds, _linearised
-from cdiff_cli.projection.state import nearest
+from cdiff_cli.projection.state import project_state
 
 REFINEMENTS = 3  # choices of the tangent planes; within sampling one: the others change a plan's distance by 2.5 % at most
 ADMM_ROUNDS = 600  # at most, where a part is met with dynamics by its projection alone (projection/dynamics.py)
@@ -62,8 +62,12 @@ def project(g: Constraint, z: Traj, pins: Pins, *, strict: bool = True) -> Traj:
 
 
 def project_reachable(
-    g: Constraint, z: Traj, pins: Pins, warm: Warm | None = None, tolerance: float = 1e-6
-) -> tuple[Traj, Warm]:
+    g: Constraint,
+    z: Traj,
+    pins: Pins,
+    warm: ActiveSetWarmStart | None = None,
+    tolerance: float = 1e-6,
+) -> tuple[Traj, ActiveSetWarmStart]:
     """The same for a g with dynamics: obeyed exactly, the other parts to the tolerance (environment units), from where an earlier
     call ended. In float64 within, the other parts on the coordinates that they constrain alone.
     """
@@ -82,7 +86,7 @@ def project_reachable(
     target, held = part.decode(z), Pins(pins.mask, part.decode(pins.values.to(z)))
     if len(paces) == len(rest) > 0:
         begin = None if warm is None else part.dynamics.rollout(target[:, 0], warm.u)
-        x, u = nearest_paced(
+        x, u = project_rate_dynamics(
             part.dynamics,
             around,
             paces,
@@ -95,8 +99,8 @@ def project_reachable(
             begin=begin,
         )
         none = u.new_zeros(len(u), 0)  # an interior point begins anew but for the inputs
-        return pins.paint(part.encode(x).to(kind)), Warm(none, u, none, none, none)
-    x, warm = nearest_reachable(
+        return pins.paint(part.encode(x).to(kind)), ActiveSetWarmStart(none, u, none, none, none)
+    x, warm = project_dynamics(
         part.dynamics,
         around,
         _rest(rest),
@@ -112,39 +116,39 @@ def project_reachable(
     return pins.paint(part.encode(x).to(kind)), warm
 
 
-def _rest(parts: Sequence[Part]) -> Callable[[Traj, Pins], Traj] | None:
+def _rest(parts: Sequence[TrajectoryConstraint]) -> Callable[[Traj, Pins], Traj] | None:
     """The projection onto these parts as ADMM asks for it, with the same pins round after round; None where there are none."""
     return (lambda p, held: _project(Constraint(tuple(parts)), p, held, False)) if parts else None
 
 
-def _coordinates(parts: Sequence[Part], dim: int) -> list[int]:
+def _coordinates(parts: Sequence[TrajectoryConstraint], dim: int) -> list[int]:
     """The coordinates that the parts constrain."""
     found = torch.zeros(dim, dtype=torch.bool, device="cpu")
     for part in parts:
-        level = part.acting if isinstance(part, Chain) else getattr(part, "level", None)
-        if isinstance(level, Affine):
+        level = part.acting if isinstance(part, DiscreteBarrier) else getattr(part, "level", None)
+        if isinstance(level, HalfSpace):
             found |= (level.a != 0).view(-1, dim).any(0).cpu()
         elif isinstance(level, Ellipsoid):
             found |= (level.which != 0).view(-1, dim).any(0).cpu()
-        elif isinstance(part, Rate):
+        elif isinstance(part, RateLimit):
             found |= (part.which != 0).any(0).cpu()
         else:
             found[:] = True
     return found.nonzero()[:, 0].tolist()
 
 
-def _restricted(part: Part, used: Sequence[int]) -> Part:
+def _restricted(part: TrajectoryConstraint, used: Sequence[int]) -> TrajectoryConstraint:
     """The same part of those coordinates alone."""
-    if isinstance(part, Rate):
+    if isinstance(part, RateLimit):
         return replace(part, **{name: getattr(part, name)[..., used] for name in part.trailing})
     numbers: dict[str, Any] = {}
     for name in ("level", "ahead"):
         level = getattr(part, name, None)
-        if isinstance(level, Affine):
+        if isinstance(level, HalfSpace):
             numbers[name] = replace(level, a=level.a[..., used])
         elif isinstance(level, Ellipsoid):
             numbers[name] = replace(level, which=level.which[..., used])
-    return cast(Part, replace(cast(Any, part), **numbers)) if numbers else part
+    return cast(TrajectoryConstraint, replace(cast(Any, part), **numbers)) if numbers else part
 
 
 def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
@@ -154,7 +158,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
         _refuse_pinned_violations(g, z, pins, max(tolerance, 1e-6))
     if not g.parts or z.numel() == 0:
         return z
-    sliding = any(isinstance(part, Segments) for part in g.parts)
+    sliding = any(isinstance(part, OnSegments) for part in g.parts)
     around = cast(Any, [part for part in g.parts if sliding and tangible(part)])
     others = [part for part in g.parts if not (sliding and tangible(part))]
     if (
@@ -167,12 +171,12 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
     begin, turns, rates = (
         z,
         REFINEMENTS if strict else 1,
-        [part for part in others if isinstance(part, Rate)],
+        [part for part in others if isinstance(part, RateLimit)],
     )
     paces = [part for part in others if limits_steps(part)]
     paced = bool(rates) and len(paces) == len(others) and bounds_only(pins)
     if paced and (around or len(rates) < len(paces)):
-        begin = nearest_slowed(around, paces, z, pins, turns)
+        begin = project_rates(around, paces, z, pins, turns)
         return (
             begin
             if not strict or _holds(g, begin, pins)
@@ -180,8 +184,10 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
         )
     if (pins.whole or not others) and all(has_exact_form(part) for part in others):
         onto = [lambda y: _around(around, y, pins, turns)] if around else []
-        onto += [Slowed(rates, pins)] if rates else []
-        onto += [partial(exact, part, pins=pins) for part in others if not isinstance(part, Rate)]
+        onto += [RateProjection(rates, pins)] if rates else []
+        onto += [
+            partial(exact, part, pins=pins) for part in others if not isinstance(part, RateLimit)
+        ]
         x = onto[0](z) if len(onto) == 1 else _dykstra(g, onto, z, pins, tolerance)
         if len(g.parts) == 1 and not around and pins.loose[1] == z.shape[1]:
             return x  # one exact form misses only what is pinned behind what it moves
@@ -195,7 +201,7 @@ def _project(g: Constraint, z: Traj, pins: Pins, strict: bool) -> Traj:
             (_free_rows(g, x, pins) > 100 * tolerance).any()
         ):  # pinned ends can contradict a chain between them
             return x
-        if paced and _holds(g, x := nearest_slowed((), paces, z, pins), pins):
+        if paced and _holds(g, x := project_rates((), paces, z, pins), pins):
             return x  # near to what the pins leave, ADMM takes more than its rounds
         begin = x if around else z  # near the set, on the side where the path passes
     return _sequential(g, z, begin, pins, tolerance)
@@ -214,12 +220,14 @@ def _onto_one(g: Constraint, z: Traj, pins: Pins, tolerance: float) -> Traj | No
     return x if bool((_free_rows(g, x, pins) <= tolerance).all()) else None
 
 
-def tangible(part: Part) -> bool:
+def tangible(part: TrajectoryConstraint) -> bool:
     """Whether planes tangent to the part's surface, a few a waypoint, make a convex part of its set (segments.py)."""
-    return (isinstance(part, Waypoints) and isinstance(part.level, Affine)) or goes_round(part)
+    return (
+        isinstance(part, AtWaypoints) and isinstance(part.level, HalfSpace)
+    ) or excludes_ellipsoid(part)
 
 
-def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins, rounds: int) -> Traj:
+def _around(parts: Sequence[AtWaypoints | OnSegments], z: Traj, pins: Pins, rounds: int) -> Traj:
     """Projection onto the half-spaces of tangent planes, chosen anew at each result; plans that obey already are left alone."""
     touched = crossed(parts, z).nonzero()[:, 0]
     if not len(touched):
@@ -228,31 +236,33 @@ def _around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins, rounds: 
     if every:
         return nearest_around(parts, z, pins, rounds)
     return z.index_copy(
-        0, touched, nearest_around([part.take(touched) for part in parts], z[touched], pins, rounds)
+        0,
+        touched,
+        nearest_around([part.select(touched) for part in parts], z[touched], pins, rounds),
     )
 
 
-def has_exact_form(part: Part) -> bool:
-    if isinstance(part, Waypoints):
-        return isinstance(part.level, Affine | Quadric | Framed | Ellipsoid)
-    if isinstance(part, Rate):
+def has_exact_form(part: TrajectoryConstraint) -> bool:
+    if isinstance(part, AtWaypoints):
+        return isinstance(part.level, HalfSpace | Quadric | QuadricInFrame | Ellipsoid)
+    if isinstance(part, RateLimit):
         return True
-    if not isinstance(part, Chain):
+    if not isinstance(part, DiscreteBarrier):
         return False
     level = part.acting
-    return isinstance(level, Affine | Approach) or (
+    return isinstance(level, HalfSpace | BallHOCBF) or (
         isinstance(level, Ellipsoid) and level.side > 0 and level.is_ball
     )
 
 
-def exact(part: Part, z: Traj, pins: Pins) -> Traj:
+def exact(part: TrajectoryConstraint, z: Traj, pins: Pins) -> Traj:
     """Projection onto one part that has an exact form."""
-    if isinstance(part, Waypoints):
-        return pins.paint(nearest(part.level, z))
-    if isinstance(part, Rate):
-        return Slowed([part], pins)(z)
-    assert isinstance(part, Chain)
-    return pins.paint(nearest_on_chain(part, z, pins))
+    if isinstance(part, AtWaypoints):
+        return pins.paint(project_state(part.level, z))
+    if isinstance(part, RateLimit):
+        return RateProjection([part], pins)(z)
+    assert isinstance(part, DiscreteBarrier)
+    return pins.paint(project_barrier(part, z, pins))
 
 
 def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: float) -> Traj:
@@ -261,7 +271,7 @@ def _sequential(g: Constraint, z: Traj, begin: Traj, pins: Pins, tolerance: floa
     for b in range(len(z)):
         target, x = z[b : b + 1].double(), begin[b : b + 1].double()
         held = Pins(pins.mask, x)
-        one = g.take(torch.tensor([b], device=z.device)).to(x)
+        one = g.select(torch.tensor([b], device=z.device)).to(x)
         at = _linearised(one, target, x, held, tolerance)
         if not _holds(one, at, held):
             kept = _conflict(one, target, x, held, tolerance)

@@ -9,14 +9,14 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate
+from cdiff_cli.constraints.rate import RateLimit
 
 ROUNDS = 6000  # of ADMM at most; from nothing to 1e-9 it takes 1300 to 2000 on the mazes' plans
 RELAXATION = 1.7
 
 
 @dataclass
-class Slowed:
+class RateProjection:
     """The projection onto limits with the same pins, again and again: each call begins where the last one ended.
 
     parts  of one frame, as those of a constraint are
@@ -24,7 +24,7 @@ class Slowed:
            another   [k, horizon - 1, batch]
     """
 
-    parts: Sequence[Rate]
+    parts: Sequence[RateLimit]
     pins: Pins
     warm: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
@@ -34,7 +34,7 @@ class Slowed:
             z = self._onto(i, group, z)
         return z
 
-    def _onto(self, i: int, parts: Sequence[Rate], z: Traj) -> Traj:
+    def _onto(self, i: int, parts: Sequence[RateLimit], z: Traj) -> Traj:
         batch, horizon, _ = z.shape
         if horizon < 2 or (
             i not in self.warm and not any(bool((part(z) > 0).any()) for part in parts)
@@ -83,7 +83,7 @@ class Slowed:
         return out
 
 
-def _cut(parts: Sequence[Rate], change: Tensor) -> Tensor:
+def _cut(parts: Sequence[RateLimit], change: Tensor) -> Tensor:
     """Changes, the limits' one after another, each brought within its own."""
     if len(parts) == 1:
         return parts[0].cut(change)
@@ -91,9 +91,9 @@ def _cut(parts: Sequence[Rate], change: Tensor) -> Tensor:
     return torch.cat([part.cut(one) for part, one in zip(parts, each, strict=True)])
 
 
-def coupled(parts: Sequence[Rate]) -> list[list[Rate]]:
+def coupled(parts: Sequence[RateLimit]) -> list[list[RateLimit]]:
     """The limits in groups of which no two share a coordinate: their projections, one after another, are then that onto all."""
-    groups: list[list[Rate]] = []
+    groups: list[list[RateLimit]] = []
     for part in parts:
         meeting = [
             group
@@ -106,12 +106,12 @@ def coupled(parts: Sequence[Rate]) -> list[list[Rate]]:
     return groups
 
 
-def _alone(parts: Sequence[Rate], pins: Pins, z: Traj, b: int) -> Traj:
+def _alone(parts: Sequence[RateLimit], pins: Pins, z: Traj, b: int) -> Traj:
     """The projection of one plan of a batch whose frames differ."""
     which = torch.tensor([b], device=z.device)
-    return Slowed([part.take(which) for part in parts], Pins(pins.mask, pins.values[which]))(
-        z[which]
-    )
+    return RateProjection(
+        [part.select(which) for part in parts], Pins(pins.mask, pins.values[which])
+    )(z[which])
 
 
 @lru_cache(maxsize=16)

@@ -16,25 +16,25 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine
-from cdiff_cli.constraints.trajectory import Constraint, Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import HalfSpace
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.segments import NEVER, planes
-from cdiff_cli.projection.solvers.interior_point import YIELDING, Limits, nearest
+from cdiff_cli.projection.solvers.interior_point import YIELDING, ConicLimits, solve
 
-Pace = Rate | Chain
+StepLimit = RateLimit | DiscreteBarrier
 MISSED = 1e-4  # of a limit, in shares of it, metres of a half-space: from there on they contradict each other
 
 
-def nearest_paced(
+def project_rate_dynamics(
     dynamics: LinearDynamics,
-    parts: Sequence[Waypoints | Segments],
-    paces: Sequence[Pace],
+    parts: Sequence[AtWaypoints | OnSegments],
+    paces: Sequence[StepLimit],
     z: Traj,
     pins: Pins,
     *,
@@ -63,13 +63,13 @@ def nearest_paced(
     touched, walled = (g(x[..., where]) > 0).any(1), ~todo
     for turn in range(turns + 1):
         if bool(touched.any()):
-            near = [part.take(touched.nonzero()[:, 0]) for part in parts]
+            near = [part.select(touched.nonzero()[:, 0]) for part in parts]
             a, b = planes(near, x[touched][..., where], Pins(held.mask, held.values[touched]))
             there, slope = free & (b < NEVER), torch.zeros_like(walls.L[touched])
             slope[:, :, :, 0, where] = torch.where(there[..., None], -a, 0.0)
             walls.L[touched], walls.o[touched] = slope, torch.where(there, b, 1.0)[..., None]
         walled = walled | touched
-        limits = [*always, Limits(walls.L[todo], walls.o[todo])] if parts else always
+        limits = [*always, ConicLimits(walls.L[todo], walls.o[todo])] if parts else always
         x[todo], u[todo] = _within(dynamics, limits, z[todo], weight, last)
         unsafe = (g(x[..., where]) > tolerance).any(1)
         todo = touched = unsafe & ~walled | walled & (turn + 1 < turns)
@@ -78,11 +78,13 @@ def nearest_paced(
     return x, u
 
 
-def limits_steps(part: Part) -> TypeGuard[Pace]:
+def limits_steps(part: TrajectoryConstraint) -> TypeGuard[StepLimit]:
     """Whether what the part asks is a convex limit of each step: of the two states that it joins."""
-    if isinstance(part, Chain):
-        return part.alpha2 is None and isinstance(part.acting, Affine) and part.acting.a.ndim == 1
-    return isinstance(part, Rate) and part.scale.ndim == 1
+    if isinstance(part, DiscreteBarrier):
+        return (
+            part.alpha2 is None and isinstance(part.acting, HalfSpace) and part.acting.a.ndim == 1
+        )
+    return isinstance(part, RateLimit) and part.scale.ndim == 1
 
 
 def bounds_only(pins: Pins) -> bool:
@@ -90,9 +92,9 @@ def bounds_only(pins: Pins) -> bool:
     return pins.whole and bool(pins.held[:1].all()) and not bool(pins.held[1:-1].any())
 
 
-def nearest_slowed(
-    parts: Sequence[Waypoints | Segments],
-    paces: Sequence[Pace],
+def project_rates(
+    parts: Sequence[AtWaypoints | OnSegments],
+    paces: Sequence[StepLimit],
     z: Traj,
     pins: Pins,
     turns: int = 0,
@@ -103,7 +105,7 @@ def nearest_slowed(
         torch.eye(z.shape[2], dtype=wide.dtype, device=wide.device),
         wide.new_zeros(z.shape[2]),
     )
-    x, _ = nearest_paced(
+    x, _ = project_rate_dynamics(
         LinearDynamics(one, one, none, none - torch.inf, none + torch.inf),
         [part.to(wide) for part in parts],
         [pace.to(wide) for pace in paces],
@@ -118,31 +120,31 @@ def nearest_slowed(
 
 
 def _within(
-    dynamics: LinearDynamics, limits: Sequence[Limits], z: Tensor, weight: Tensor, end: Tensor
+    dynamics: LinearDynamics, limits: Sequence[ConicLimits], z: Tensor, weight: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The nearest trajectories within the limits, and their inputs; where there are none, goals and then limits give way."""
     n, u = z.shape[2], 0.5 * dynamics.inputs(z)
     begin = torch.cat((dynamics.rollout(z[:, 0], u), torch.nn.functional.pad(u, (0, 0, 0, 1))), 2)
-    q = nearest(dynamics.A, dynamics.B, limits, z, weight, begin, end)
+    q = solve(dynamics.A, dynamics.B, limits, z, weight, begin, end)
     missed = torch.where(end, q[:, -1, :n] - z[:, -1], 0.0).abs().amax(1)
     missed = torch.stack((missed, *(each.missed(q) for each in limits))).amax(0)
     soft = ~(missed < MISSED)
     if bool(soft.any()):
-        some = [each.take(soft) if len(z) > 1 else each for each in limits]
-        q[soft] = nearest(dynamics.A, dynamics.B, some, z[soft], weight, begin[soft], end, YIELDING)
+        some = [each.select(soft) if len(z) > 1 else each for each in limits]
+        q[soft] = solve(dynamics.A, dynamics.B, some, z[soft], weight, begin[soft], end, YIELDING)
     return q[..., :n], q[:, :-1, n:]
 
 
-def _none(parts: Sequence[Waypoints | Segments], x: Tensor, u: Tensor) -> Limits:
+def _none(parts: Sequence[AtWaypoints | OnSegments], x: Tensor, u: Tensor) -> ConicLimits:
     """As many half-spaces a waypoint as planes() makes of the parts, none of them there yet."""
-    count = sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
+    count = sum(1 if isinstance(part.level, HalfSpace) else 2 for part in parts)
     shape = (*x.shape[:2], count, 1)
-    return Limits(x.new_zeros(*shape, x.shape[2] + u.shape[2]), x.new_ones(shape))
+    return ConicLimits(x.new_zeros(*shape, x.shape[2] + u.shape[2]), x.new_ones(shape))
 
 
 def _always(
-    dynamics: LinearDynamics, paces: Sequence[Pace], used: list[int], horizon: int
-) -> list[Limits]:
+    dynamics: LinearDynamics, paces: Sequence[StepLimit], used: list[int], horizon: int
+) -> list[ConicLimits]:
     """Inputs within their bounds, in shares of half their range, with chains and the rates of single coordinates; lengths of rates.
     Rates in shares of their larger limit.
     """
@@ -158,8 +160,8 @@ def _always(
     ]
     lengths = []
     for pace in paces:
-        if isinstance(pace, Chain):
-            level, kept = cast(Affine, pace.acting), 1 - pace.alpha
+        if isinstance(pace, DiscreteBarrier):
+            level, kept = cast(HalfSpace, pace.acting), 1 - pace.alpha
             rows.append(
                 (
                     (level.a @ (kept * one[used] - after))[None],
@@ -182,4 +184,4 @@ def _always(
     L, o = (torch.cat(v) for v in zip(*rows, strict=True))
     there = o.isfinite()
     single = [(L[there][:, None], o[there][:, None])] if bool(there.any()) else []
-    return [Limits(*each).of_steps(horizon) for each in (*single, *lengths)]
+    return [ConicLimits(*each).of_steps(horizon) for each in (*single, *lengths)]

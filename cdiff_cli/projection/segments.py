@@ -17,10 +17,10 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj, each_end, times
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
-from cdiff_cli.constraints.trajectory import Constraint, Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.solvers.sphere_normals import (
     ROUNDING,
     ahead,
@@ -34,11 +34,11 @@ Planes = tuple[Tensor, Tensor]
 NEVER = 1e30  # bound of a half-space that is not there
 
 
-def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes:
+def planes(parts: Sequence[AtWaypoints | OnSegments], x: Traj, pins: Pins) -> Planes:
     """Half-spaces of each waypoint that together imply the parts: the affine ones themselves, for each ball the tangent planes of
     the segment before and after.
     """
-    m = sum(1 if isinstance(part.level, Affine) else 2 for part in parts)
+    m = sum(1 if isinstance(part.level, HalfSpace) else 2 for part in parts)
     batch, horizon, dim = x.shape
     a, b = (
         x.new_zeros(dim, batch, m, horizon),
@@ -50,7 +50,7 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     )
     for part in parts:
         level = part.level
-        if isinstance(level, Affine):
+        if isinstance(level, HalfSpace):
             rows[at], bounds[at] = level.a, level.b
             at += 1
             continue
@@ -74,12 +74,12 @@ def planes(parts: Sequence[Waypoints | Segments], x: Traj, pins: Pins) -> Planes
     return a.permute(1, 3, 2, 0), b.transpose(1, 2)
 
 
-def crossed(parts: Sequence[Waypoints | Segments], x: Traj, tolerance: float = 0.0) -> Tensor:
+def crossed(parts: Sequence[AtWaypoints | OnSegments], x: Traj, tolerance: float = 0.0) -> Tensor:
     """Which trajectories violate one of the parts, those that planes() takes, by more than the tolerance [batch]."""
     found = []
     for part in parts:
         level = part.level
-        if isinstance(level, Affine):
+        if isinstance(level, HalfSpace):
             found.append((level(x) > tolerance).any(1))
         else:
             assert isinstance(level, Ellipsoid)
@@ -95,13 +95,15 @@ def crossed(parts: Sequence[Waypoints | Segments], x: Traj, tolerance: float = 0
     )
 
 
-def goes_round(part: Part) -> TypeGuard[Segments]:
+def excludes_ellipsoid(part: TrajectoryConstraint) -> TypeGuard[OnSegments]:
     """Whether the part keeps segments outside a ball or an ellipsoid, so that tangent planes stand for it."""
-    return isinstance(part, Segments) and isinstance(part.level, Ellipsoid) and part.level.side > 0
+    return (
+        isinstance(part, OnSegments) and isinstance(part.level, Ellipsoid) and part.level.side > 0
+    )
 
 
 @dataclass(frozen=True)
-class Turned:
+class TangentPlanes:
     """A constraint in which half-spaces of tangent planes stand for the parts that go round balls: the rows of the other parts,
     then for each ball those of the segments before each waypoint, and of those after it, in the parts' own units; -1 where there is
     no such segment.
@@ -139,11 +141,11 @@ class Turned:
         return (w.reshape(self.b.shape) * self.a).sum(2).movedim(0, -1)
 
 
-def apart(g: Constraint) -> tuple[list[Segments], Constraint]:
+def split_excluded(g: Constraint) -> tuple[list[OnSegments], Constraint]:
     """The parts of g that go round a ball, and the others."""
-    round_ = [part for part in g.parts if goes_round(part)]
+    round_ = [part for part in g.parts if excludes_ellipsoid(part)]
     return round_, Constraint(
-        tuple(part for part in g.parts if not goes_round(part))
+        tuple(part for part in g.parts if not excludes_ellipsoid(part))
     ) if round_ else g
 
 
@@ -154,15 +156,15 @@ def row_blocks(g: Constraint, horizon: int, planes: bool) -> list[slice]:
     planes   of the rows of turned(g): those of the other parts, then of each ball the segments before each waypoint and those
              after it; False: of the rows of g itself
     """
-    round_, rest = apart(g) if planes else ([], g)
+    round_, rest = split_excluded(g) if planes else ([], g)
     counts = [len(part.labels(horizon)) for part in rest.parts] + 2 * len(round_) * [horizon]
     ends = list(accumulate(counts, initial=0))
     return [slice(begin, end) for begin, end in pairwise(ends)]
 
 
-def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint | Turned:
+def with_tangent_planes(g: Constraint, x: Traj, pins: Pins) -> Constraint | TangentPlanes:
     """g with half-spaces of tangent planes at x in the place of each part that goes round a ball."""
-    round_, rest = apart(g)
+    round_, rest = split_excluded(g)
     if not round_:
         return g
     a, b = planes(round_, x, pins)
@@ -172,7 +174,7 @@ def turned(g: Constraint, x: Traj, pins: Pins) -> Constraint | Turned:
         own, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[:, None]
         a[:, :, own] *= m
         b[:, own] = torch.where(b[:, own] == NEVER, 1.0, m * b[:, own])
-    return Turned(rest, a, b)
+    return TangentPlanes(rest, a, b)
 
 
 def _tangent(n: Tensor, which: Tensor, centre: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
@@ -223,7 +225,9 @@ def _moved(z: Traj, halfspaces: Planes, pins: Pins) -> tuple[Traj, Tensor]:
     return z.flatten(0, 1).index_add(0, at, step.T.to(z)).view(z.shape), at
 
 
-def nearest_around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins, rounds: int) -> Traj:
+def nearest_around(
+    parts: Sequence[AtWaypoints | OnSegments], z: Traj, pins: Pins, rounds: int
+) -> Traj:
     """The nearest trajectory in the half-spaces of tangent planes, chosen at z and then anew at each result: the set so described
     holds the last result, so the distance to z can only fall. What the first choice leaves where it is the others do too.
     """
@@ -252,7 +256,7 @@ def nearest_around(parts: Sequence[Waypoints | Segments], z: Traj, pins: Pins, r
 
 
 def _planes_beside(
-    parts: Sequence[Waypoints | Segments],
+    parts: Sequence[AtWaypoints | OnSegments],
     x: Traj,
     beside: Tensor,
     missing: Tensor | None,
@@ -275,7 +279,7 @@ def _planes_beside(
 
     for part in parts:
         level = part.level
-        if isinstance(level, Affine):
+        if isinstance(level, HalfSpace):
             slots.append((own(level.a, 1).expand(n, dim).T[:, None], own(level.b, 0).expand(1, n)))
             continue
         assert isinstance(level, Ellipsoid)

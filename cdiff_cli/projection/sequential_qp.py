@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Rows, Traj
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 
 
 def _linearised(
@@ -72,10 +72,10 @@ def _movable(g: Constraint, x: Traj, pins: Pins) -> Tensor:
     free = (~pins.mask).any(1)
     each = []
     for part in g.parts:
-        if isinstance(part, Waypoints):
+        if isinstance(part, AtWaypoints):
             each.append(free)
-        elif isinstance(part, Chain | Segments | Rate):
-            order = len(part.coefficients) - 1 if isinstance(part, Chain) else 1
+        elif isinstance(part, DiscreteBarrier | OnSegments | RateLimit):
+            order = len(part.coefficients) - 1 if isinstance(part, DiscreteBarrier) else 1
             each.append(free.unfold(0, order + 1, 1).any(1) if len(free) > order else free[:0])
         else:
             each.append(torch.ones(len(part.labels(x.shape[1])), dtype=torch.bool, device=x.device))

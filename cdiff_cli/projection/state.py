@@ -4,18 +4,18 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import dot, times
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Framed, Level, Quadric
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame, StateSet
 from cdiff_cli.errors import InfeasibleError
 
 
-def nearest(level: Level, z: Tensor) -> Tensor:
+def project_state(level: StateSet, z: Tensor) -> Tensor:
     """The nearest state with f <= 0, for states z [..., dim]."""
-    if isinstance(level, Affine):
+    if isinstance(level, HalfSpace):
         size = level.a.square().sum(-1).clamp_min(1e-30)
         return z - (level(z).clamp_min(0) / size)[..., None] * level.a
     if isinstance(level, Ellipsoid):
         return _nearest_ball(level, z) if level.is_ball else _nearest_quadric(level.quadric(), z)
-    assert isinstance(level, Quadric | Framed)
+    assert isinstance(level, Quadric | QuadricInFrame)
     return _nearest_quadric(level if isinstance(level, Quadric) else level.multiplied_out(), z)
 
 

@@ -25,7 +25,13 @@ from cdiff_cli.arrays import Pull, Rows, Traj
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.projection.project import project
-from cdiff_cli.projection.segments import Turned, apart, crossed, row_blocks, turned
+from cdiff_cli.projection.segments import (
+    TangentPlanes,
+    crossed,
+    row_blocks,
+    split_excluded,
+    with_tangent_planes,
+)
 from cdiff_cli.sampling.baselines import BestOf, Conditional, FinalProjection, Guidance
 from cdiff_cli.sampling.safediffuser import SafeDiffuser
 from cdiff_cli.sampling.sampler import Method, Step
@@ -103,12 +109,14 @@ class PrimalDual:
         if self.on != "clean":
             at = step.x if self.on == "noisy" else step.x0
             rows, pull, _ = linearise(
-                g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive
+                g if self.on == "noisy" else with_tangent_planes(g, at, step.pins),
+                at,
+                self.positive,
             )
             push = step.pins.free(pull(spread(lam, rows)))
             x = step.reverse(step.x0) - weight(self.coefficient, step) * push
             return x, (lam + self.eta * expect(rows, self.expectation)).clamp_min(0)
-        flat = turned(g, step.x0, step.pins)
+        flat = with_tangent_planes(g, step.x0, step.pins)
         rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         rows, _, size = linearise(flat, x0, self.positive)
@@ -156,14 +164,16 @@ class AugmentedLagrangian:
         if self.on != "clean":
             at = step.x if self.on == "noisy" else step.x0
             rows, pull, _ = linearise(
-                g if self.on == "noisy" else turned(g, at, step.pins), at, self.positive
+                g if self.on == "noisy" else with_tangent_planes(g, at, step.pins),
+                at,
+                self.positive,
             )
             m = multiplier(expect(rows, self.expectation), lam, rho)
             push = step.pins.free(pull(spread(m, rows)))
             return step.reverse(step.x0) - weight(self.coefficient, step) * push, AlmState(
                 m, self._grown(rho)
             )
-        flat = turned(g, step.x0, step.pins)
+        flat = with_tangent_planes(g, step.x0, step.pins)
         rows, pull, _ = linearise(flat, step.x0, self.positive)
         x0 = step.x0 - step.pins.free(pull(spread(lam, rows)))
         rows, pull, size = linearise(flat, x0, self.positive)
@@ -250,7 +260,7 @@ def idle(g: Constraint, step: Step, lam: Rows) -> bool:
     """Whether a dual step on the clean estimate would change nothing: it obeys g, and no multiplier stands."""
     if _positive(lam):
         return False
-    round_, others = apart(g)
+    round_, others = split_excluded(g)
     if round_ and bool(crossed(round_, step.x0).any()):
         return False
     return not _positive(others(step.x0))
@@ -261,7 +271,9 @@ def _positive(rows: Rows) -> bool:
     return rows.numel() > 0 and not float(rows.amax()) <= 0
 
 
-def linearise(g: Constraint | Turned, x: Traj, positive: Positive) -> tuple[Rows, Pull, Rows]:
+def linearise(
+    g: Constraint | TangentPlanes, x: Traj, positive: Positive
+) -> tuple[Rows, Pull, Rows]:
     """g(x), its pull w -> w^T dg/dx and row sizes |dg/dx|^2, of g itself or of its smooth positive part g / (1 + e^-g)."""
     rows, pull, size = g.linearise(x)
     if positive == "none":

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.rate import Rate
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.trajectory import Constraint, Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
 from cdiff_cli.sampling.sampler import Step
@@ -73,7 +73,7 @@ class SafeDiffuser:
         return step.pins.paint(torch.where((u == u0).reshape(asked.shape), asked, moved)), None
 
 
-class Rows(NamedTuple):
+class BarrierRows(NamedTuple):
     """A u <= c: A [batch, groups, n, k], c [batch, groups, n], a group of k coordinates a waypoint or a whole plan; float64."""
 
     A: Tensor
@@ -86,10 +86,10 @@ def relaxation(left: int) -> tuple[float, float]:
     return 1 - s, s * (1 - s)
 
 
-def rows_of(g: Constraint, step: Step, offset: float, gain: float) -> Rows:
+def rows_of(g: Constraint, step: Step, offset: float, gain: float) -> BarrierRows:
     """dg(x_t).u <= offset - gain g(x_t) on the free coordinates; rows that move none of them ask nothing."""
     x, free = step.x, ~step.pins.mask
-    if all(isinstance(part, Waypoints) for part in g.parts):
+    if all(isinstance(part, AtWaypoints) for part in g.parts):
         each = [part.linearise(x) for part in g.parts]
         A = (
             torch.stack([pull(torch.ones_like(values)) for values, pull, _ in each], 2)
@@ -101,18 +101,18 @@ def rows_of(g: Constraint, step: Step, offset: float, gain: float) -> Rows:
         A = (A * free).flatten(2)[:, None]
         values = g(x)[:, None]
     A, c = A.double(), offset - gain * values.double()
-    return Rows(A, torch.where(A.abs().amax(-1) > 1e-9, c, torch.inf))
+    return BarrierRows(A, torch.where(A.abs().amax(-1) > 1e-9, c, torch.inf))
 
 
-def jacobian(part: Part, x: Traj) -> Tensor:
+def jacobian(part: TrajectoryConstraint, x: Traj) -> Tensor:
     """dg/dx [batch, n, horizon, dim]: rows that share no waypoint are pulled back together."""
     values, pull, _ = part.linearise(x)
     n, horizon = values.shape[1], x.shape[1]
     reaches = {
-        Waypoints: 1,
-        Segments: 2,
-        Rate: 2,
-        Chain: len(part.coefficients) if isinstance(part, Chain) else 0,
+        AtWaypoints: 1,
+        OnSegments: 2,
+        RateLimit: 2,
+        DiscreteBarrier: len(part.coefficients) if isinstance(part, DiscreteBarrier) else 0,
     }
     reach = reaches.get(type(part))
     out = x.new_zeros(len(x), n, horizon, x.shape[2])
@@ -139,7 +139,7 @@ def one_hot(row: int, like: Tensor) -> Tensor:
 # the QP ---------------------------------------------------------------------------------------------------------------
 
 
-def by_active_set(rows: Rows, u0: Tensor, r: float = 0.0) -> Tensor:
+def by_active_set(rows: BarrierRows, u0: Tensor, r: float = 0.0) -> Tensor:
     """argmin |u - u0|^2 + |slack|^2 s.t. A u + r slack <= c, exactly: u = u0 - A^T lam, where lam solves the dual."""
     over = (rows.A @ u0[..., None])[..., 0] - rows.c
     touched = (over > 0).any(-1)
@@ -161,7 +161,7 @@ def _multipliers(M: Tensor, d: Tensor) -> Tensor:
     return nonnegative_least(M, d, tolerance, tolerance / size)
 
 
-def by_proxqp(rows: Rows, u0: Tensor, r: float = 0.0) -> Tensor:
+def by_proxqp(rows: BarrierRows, u0: Tensor, r: float = 0.0) -> Tensor:
     """The same by ProxQP, one QP after another."""
     import qpsolvers
 

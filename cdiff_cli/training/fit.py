@@ -37,11 +37,11 @@ from cdiff_cli.training.demonstrations import (
     load_rewards,
 )
 from cdiff_cli.training.inverse_dynamics import fit_inverse
-from cdiff_cli.training.labels import LABELS, Condition
+from cdiff_cli.training.labels import LABELS, ConstraintLabel
 from cdiff_cli.training.loss import Weighing, training_loss
-from cdiff_cli.training.return_labels import Returns
+from cdiff_cli.training.return_labels import ReturnLabel
 from cdiff_cli.training.system_identification import fit
-from cdiff_cli.training.windows import Data, Draw
+from cdiff_cli.training.windows import Draw, TrainingSet
 
 LINEAR = 0.99  # share of the transitions that linear dynamics must explain to be kept: plans are held to them
 
@@ -66,7 +66,7 @@ def train(
     work: Path,
     resume: bool = False,
     dataset: str | None = None,
-    condition: Condition | None = None,
+    condition: ConstraintLabel | None = None,
     save_every: int = 500,
     on_data: Progress | None = None,
     on_step: Callable[[Status], None] | None = None,
@@ -105,11 +105,11 @@ def train(
         task, source
     )  # before the long part: a dataset without them is refused at once
     returns = (
-        Returns.of(episodes, load_rewards(source, episodes), spec.returns.discount)
+        ReturnLabel.from_episodes(episodes, load_rewards(source, episodes), spec.returns.discount)
         if spec.returns
         else None
     )
-    data = Data.of(task, recipe, spec, episodes, condition, seed, returns)
+    data = TrainingSet.from_episodes(task, recipe, spec, episodes, condition, seed, returns)
     commit = git_commit()
     state = _Fit.start(len(task.layout), recipe, spec, seed, device, digest(episodes))
     if resume:

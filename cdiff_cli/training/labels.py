@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.observed import Observed, Seen
+from cdiff_cli.constraints.observed import Observed, ObservedValues
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
 
@@ -16,7 +16,7 @@ LABELS = 2  # entries of a label
 
 
 @dataclass(frozen=True)
-class Condition:
+class ConstraintLabel:
     """Constraints that a planner is conditioned on.
 
     name      of the constraint file, without its ending
@@ -31,7 +31,7 @@ class Condition:
     observed: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, path: Path, task: Any) -> "Condition":
+    def read(cls, path: Path, task: Any) -> "ConstraintLabel":
         """The constraints of a file; raises SpecError."""
         observable = getattr(task, "observable", ())
         kinds, g = load_constraints(
@@ -47,7 +47,7 @@ class Condition:
         """What a network is told: a label, and each quantity."""
         return LABELS + len(self.observed)
 
-    def label(self, x: Traj, seen: Seen | None = None, dt: float = 1.0) -> Tensor:
+    def label(self, x: Traj, seen: ObservedValues | None = None, dt: float = 1.0) -> Tensor:
         """(1 where a window obeys g, else -1; its largest g clipped to [0, 1]) [batch, 2]. x in environment units.
 
         seen   what is observed at the first waypoint of each window

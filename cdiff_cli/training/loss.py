@@ -43,7 +43,7 @@ def training_loss(
         *coarse, estimate = net.estimates(
             x_t, t.to(x0), *(() if condition is None else (condition,))
         )
-    w = weighing.of(schedule).to(x0)[t][:, None, None]
+    w = weighing.weights(schedule).to(x0)[t][:, None, None]
     e = torch.where(pinned, 0.0, estimate.float() - x0)
     loss = (w * e.square()).mean() + weighing.smoothness * (w * e.diff(dim=1).square()).mean()
     for guess in coarse:
@@ -64,7 +64,7 @@ class Weighing:
     smoothness: float = 100.0
     emphasis: float = 1.0
 
-    def of(self, schedule: Schedule) -> Tensor:
+    def weights(self, schedule: Schedule) -> Tensor:
         """w_t for t = 0 ... n_steps."""
         a = torch.tensor(schedule.alpha_bar, dtype=torch.float64)
         w = (a / (1 - a).clamp_min(1e-12)).sqrt().clamp(1.0, self.emphasis)

@@ -46,7 +46,7 @@ def mean_rewards(
 
 
 @dataclass(frozen=True)
-class Returns:
+class ReturnLabel:
     """What a network is told of the return from each state of the demonstrations on.
 
     label      (r, 1 - r), r the mean reward from `low` at -1 to `high` at 1; zeros, which mean no label, where it is not known,
@@ -59,7 +59,9 @@ class Returns:
     high: float
 
     @classmethod
-    def of(cls, episodes: Sequence[Array], rewards: Sequence[Array], discount: float) -> "Returns":
+    def from_episodes(
+        cls, episodes: Sequence[Array], rewards: Sequence[Array], discount: float
+    ) -> "ReturnLabel":
         """Labels of all states of the episodes, one after the other; CdiffError where none can be told from another."""
         mean = np.concatenate(mean_rewards(episodes, rewards, discount))
         if np.isnan(mean).all():

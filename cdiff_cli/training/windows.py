@@ -10,12 +10,12 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.models.denoiser import Telling
-from cdiff_cli.models.normaliser import LEAST, Frame, Normaliser
+from cdiff_cli.models.denoiser import ObservationEncoder
+from cdiff_cli.models.normaliser import LEAST, Normaliser, ResidualNormaliser
 from cdiff_cli.models.recipe import Recipe, TrainSpec
 from cdiff_cli.tasks.protocol import ControlTask, Task
-from cdiff_cli.training.labels import Condition, drop
-from cdiff_cli.training.return_labels import Returns
+from cdiff_cli.training.labels import ConstraintLabel, drop
+from cdiff_cli.training.return_labels import ReturnLabel
 
 SAMPLES = 64  # demonstration windows kept in a checkpoint, for pictures
 COPIES = 8  # of the demonstrations, each beside other observed quantities
@@ -31,7 +31,7 @@ def end_pins(horizon: int, dim: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Beside:
+class SampledObservations:
     """What would have been observed beside the demonstrations, had there been something to observe: several times over, for each
     is one of many.
 
@@ -42,12 +42,12 @@ class Beside:
 
     names: tuple[str, ...]
     values: Tensor
-    telling: Telling
+    telling: ObservationEncoder
 
     @classmethod
-    def of(
+    def from_task(
         cls, task: Task, episodes: Sequence[Array], names: tuple[str, ...], seed: int
-    ) -> "Beside":
+    ) -> "SampledObservations":
         """Drawn by the task's own law (observed_along); CdiffError where it has none."""
         law = getattr(task, "observed_along", None)
         if law is None:
@@ -67,7 +67,11 @@ class Beside:
             torch.from_numpy(np.concatenate(episodes)),
         )
         every = values.flatten(0, 1).unbind(1)
-        return cls(names, values, Telling.fit(names, task.layout, every, states.repeat(COPIES, 1)))
+        return cls(
+            names,
+            values,
+            ObservationEncoder.fit(names, task.layout, every, states.repeat(COPIES, 1)),
+        )
 
     def draw(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
         """Each quantity as it was at those states [n], in a copy drawn at random."""
@@ -90,7 +94,7 @@ class Windows:
     horizon: int
 
     @classmethod
-    def of(cls, episodes: Sequence[Array], horizon: int) -> "Windows":
+    def from_episodes(cls, episodes: Sequence[Array], horizon: int) -> "Windows":
         """Windows, each as likely as any other."""
         lengths = [len(episode) for episode in episodes]
         if not lengths or max(lengths) < horizon:
@@ -146,7 +150,7 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class Data:
+class TrainingSet:
     """The windows that a network is trained on, in its own coordinates.
 
     frame    of relative windows; None where the data's limits are the coordinates
@@ -157,43 +161,45 @@ class Data:
 
     windows: Windows
     normaliser: Normaliser
-    frame: Frame | None
+    frame: ResidualNormaliser | None
     pinned: Tensor
-    condition: Condition | None
+    condition: ConstraintLabel | None
     dropout: float
     dt: float
-    beside: Beside | None
-    returns: Returns | None
+    beside: SampledObservations | None
+    returns: ReturnLabel | None
 
     @classmethod
-    def of(
+    def from_episodes(
         cls,
         task: Task,
         recipe: Recipe,
         spec: TrainSpec,
         episodes: Sequence[Array],
-        condition: Condition | None,
+        condition: ConstraintLabel | None,
         seed: int,
-        returns: Returns | None = None,
-    ) -> "Data":
+        returns: ReturnLabel | None = None,
+    ) -> "TrainingSet":
         observed = condition.observed if condition else ()
         asked = (
             condition,
             spec.dropout,
             task.dt,
-            Beside.of(task, episodes, observed, seed) if observed else None,
+            SampledObservations.from_task(task, episodes, observed, seed) if observed else None,
             returns,
         )
         pinned = end_pins(recipe.horizon, len(task.layout))
         if recipe.frame == "relative":
-            windows = Windows.of([e.astype(np.float32) for e in episodes], recipe.horizon)
-            frame = fit_frame(
+            windows = Windows.from_episodes(
+                [e.astype(np.float32) for e in episodes], recipe.horizon
+            )
+            frame = fit_residual_normaliser(
                 windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant
             )
             pinned[-1] = False
             return cls(windows, frame.state, frame, pinned, *asked)
         normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)
-        windows = Windows.of(
+        windows = Windows.from_episodes(
             [normaliser.encode(torch.from_numpy(e)).float().numpy() for e in episodes],
             recipe.horizon,
         )
@@ -251,12 +257,12 @@ class Data:
 SAMPLED = 100_000  # windows that the scales are measured on
 
 
-def fit_frame(
+def fit_residual_normaliser(
     windows: Windows,
     layout: Sequence[str],
     shared: Sequence[Sequence[str]],
     invariant: Sequence[str],
-) -> Frame:
+) -> ResidualNormaliser:
     """The frame of the windows (raw states); coordinates of a shared group share their scales."""
     every = torch.arange(len(windows.starts))
     x = windows[every[:: max(1, len(every) // SAMPLED)]].double()
@@ -278,4 +284,4 @@ def fit_frame(
     for group in shared:
         columns = [layout.index(name) for name in group]
         scale[:, columns] = scale[:, columns].amax(1, keepdim=True)
-    return Frame(state, seen, mean, gain, scale.clamp_min(LEAST))
+    return ResidualNormaliser(state, seen, mean, gain, scale.clamp_min(LEAST))

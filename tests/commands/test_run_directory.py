@@ -172,7 +172,7 @@ def test_mean_and_standard_error_by_hand():
 
 
 def test_one_row_has_no_standard_error():
-    cell = Cell.of([4.0])
+    cell = Cell.from_values([4.0])
     assert (cell.mean, cell.n) == (4.0, 1)
     assert math.isnan(cell.error)
     assert cell.text(2) == "4.00"

@@ -4,10 +4,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from tests.problems import F64, ball, chain, vec, waypoints
 
 H = 6
@@ -21,8 +21,8 @@ def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, al
     a, b = torch.randn(2, 3, generator=draw, dtype=F64), torch.randn(2, generator=draw, dtype=F64)
     g = Constraint(
         (
-            Waypoints("w", Affine(a[0], b[0])),
-            Chain("c", Affine(a[1], b[1]), alpha, alpha if high_order else None),
+            AtWaypoints("w", HalfSpace(a[0], b[0])),
+            DiscreteBarrier("c", HalfSpace(a[1], b[1]), alpha, alpha if high_order else None),
         )
     )
     rows = g.condense(H, 3)
@@ -42,6 +42,9 @@ def test_what_is_not_affine_is_left_part_by_part():
     assert Constraint(()).condense(H, 2) is None
     assert waypoints(ball(1)).condense(H, 2) is None
     both = Constraint(
-        (*chain(Affine(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5).parts, *waypoints(ball(1)).parts)
+        (
+            *chain(HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5).parts,
+            *waypoints(ball(1)).parts,
+        )
     )
     assert both.condense(H, 2) is None

@@ -8,21 +8,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.dynamics import LinearDynamics, Reachable
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import (
-    Affine,
     Ellipsoid,
-    Framed,
+    HalfSpace,
     Quadric,
-    moved,
+    QuadricInFrame,
+    converted,
     segment_max,
-    take,
+    selected,
 )
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import project
 from tests.problems import (
     F64,
@@ -47,7 +47,8 @@ frames = st.sampled_from([(3, HORIZON), (3, 1), (1, HORIZON), (1, 1)])
 AROUND = {
     **KINDS,
     **{
-        f"{name} on segments": Constraint((Segments("s", level),)) for name, level in LEVELS.items()
+        f"{name} on segments": Constraint((OnSegments("s", level),))
+        for name, level in LEVELS.items()
     },
 }
 ROUNDING = 1e-9  # a few operations of float64, with 1 / scale up to 10 and 1 / r near a centre
@@ -66,7 +67,7 @@ def moving(level, seed, batch, horizon):
 
 def at(level, plan, tau):
     """The level of one plan at one waypoint, with no dimensions in front."""
-    level = take(level, torch.tensor([plan]))
+    level = selected(level, torch.tensor([plan]))
     new = {}
     for name, trailing in level.trailing.items():
         value = getattr(level, name)
@@ -145,10 +146,10 @@ def test_two_frames_one_after_the_other_are_their_composition(kind, seed):
 def test_some_plans_of_the_batch_keep_their_own_numbers(kind):
     g, z = pull_back(AROUND[kind], *frame(0, (3, HORIZON))), normal(0, 3, HORIZON, 2)
     for which in (torch.tensor([2, 0]), torch.tensor([True, False, True])):
-        torch.testing.assert_close(g.take(which)(z[which]), g(z)[which], atol=1e-12, rtol=0)
+        torch.testing.assert_close(g.select(which)(z[which]), g(z)[which], atol=1e-12, rtol=0)
     shared = pull_back(AROUND[kind], *frame(0, (1, HORIZON)))
     torch.testing.assert_close(
-        shared.take(torch.tensor([1]))(z[1:2]), shared(z)[1:2], atol=1e-12, rtol=0
+        shared.select(torch.tensor([1]))(z[1:2]), shared(z)[1:2], atol=1e-12, rtol=0
     )
 
 
@@ -194,7 +195,9 @@ def test_a_path_that_crosses_the_way_of_a_ball_is_safe_if_the_ball_is_gone():
 
 def test_dynamics_by_plan_and_waypoint_commute_with_evaluation():
     A, B = torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=F64), vec(0.0, 0.1)[:, None]
-    part = Reachable.of("d", LinearDynamics(A, B, vec(0.0, 0.0), vec(-1.0), vec(1.0)), 1e-3)
+    part = LinearDynamicsConstraint.from_dynamics(
+        "d", LinearDynamics(A, B, vec(0.0, 0.0), vec(-1.0), vec(1.0)), 1e-3
+    )
     centre, scale = frame(0, (3, HORIZON))
     back, z = part.pull_back(centre, scale), normal(0, 3, HORIZON, 2)
     torch.testing.assert_close(back(z), part(centre + scale * z), atol=1e-12, rtol=0)
@@ -202,7 +205,9 @@ def test_dynamics_by_plan_and_waypoint_commute_with_evaluation():
     leaf, w = z.clone().requires_grad_(), normal(1, *rows.shape)
     (expected,) = torch.autograd.grad(back(leaf), leaf, w)
     torch.testing.assert_close(pull(w), expected, atol=1e-10, rtol=1e-10)
-    torch.testing.assert_close(back.take(torch.tensor([1]))(z[1:2]), rows[1:2], atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        back.select(torch.tensor([1]))(z[1:2]), rows[1:2], atol=1e-12, rtol=0
+    )
 
 
 # projections ----------------------------------------------------------------------------------------------------------
@@ -213,13 +218,13 @@ def test_dynamics_by_plan_and_waypoint_commute_with_evaluation():
 @given(seed=seeds, shape=frames)
 def test_the_nearest_waypoints_are_those_of_each_plan_and_waypoint_alone(name, seed, shape):
     level, z = LEVELS[name].pull_back(*frame(seed, shape)), normal(seed, 3, HORIZON, 2)
-    x = free_projection(Constraint((Waypoints("w", level),)), z)
+    x = free_projection(Constraint((AtWaypoints("w", level),)), z)
     for plan in range(3):
         for tau in range(HORIZON):
             one = at(level, plan, tau)
-            fixed = one.multiplied_out() if isinstance(one, Framed) else one
+            fixed = one.multiplied_out() if isinstance(one, QuadricInFrame) else one
             alone = free_projection(
-                Constraint((Waypoints("w", fixed),)), z[plan, tau].reshape(1, 1, 2)
+                Constraint((AtWaypoints("w", fixed),)), z[plan, tau].reshape(1, 1, 2)
             )
             torch.testing.assert_close(
                 x[plan, tau], alone[0, 0], atol=1e-7, rtol=0
@@ -243,9 +248,9 @@ def test_chains_that_differ_by_plan_are_those_of_each_plan_alone(kind, start, se
 @given(seed=seeds)
 def test_segments_outside_balls_that_differ_by_plan_are_those_of_each_plan_alone(seed):
     level, z = moving(ball(1), seed, 3, 1), normal(seed, 3, 7, 2)
-    x = free_projection(Constraint((Segments("s", level),)), z)
+    x = free_projection(Constraint((OnSegments("s", level),)), z)
     for i in range(3):
-        alone = free_projection(Constraint((Segments("s", at(level, i, 0)),)), z[i : i + 1])
+        alone = free_projection(Constraint((OnSegments("s", at(level, i, 0)),)), z[i : i + 1])
         torch.testing.assert_close(x[i : i + 1], alone, atol=1e-9, rtol=0)
 
 
@@ -255,11 +260,11 @@ def test_segments_of_a_moving_ball_are_those_of_a_resting_one_in_its_own_frame(s
     """And in windows of another scale at each waypoint, distances are then those of the window."""
     z, offset = normal(seed, 3, 7, 2), 0.3 * normal(seed + 5, 3, 7, 2)
     x = free_projection(
-        Constraint((Segments("s", ball(1).pull_back(-offset, torch.ones(2, dtype=F64))),)), z
+        Constraint((OnSegments("s", ball(1).pull_back(-offset, torch.ones(2, dtype=F64))),)), z
     )
-    resting = free_projection(Constraint((Segments("s", ball(1)),)), z - offset)
+    resting = free_projection(Constraint((OnSegments("s", ball(1)),)), z - offset)
     torch.testing.assert_close(x - offset, resting, atol=1e-9, rtol=0)
-    back = pull_back(Constraint((Segments("s", ball(1)),)), *frame(seed, (3, 7), shared=True))
+    back = pull_back(Constraint((OnSegments("s", ball(1)),)), *frame(seed, (3, 7), shared=True))
     assert float(back(free_projection(back, z)).max()) <= 1e-7  # what project promises
 
 
@@ -277,7 +282,7 @@ def test_a_chain_over_a_half_space_with_a_scale_a_waypoint_agrees_with_proxqp(
     pins = pin(z, 0) if pinned else Pins.none(z)
     x = project(g, z, pins)
     for i in range(2):
-        one = g.take(torch.tensor([i]))
+        one = g.select(torch.tensor([i]))
         rows, pull, _ = one.linearise(z[i : i + 1])
         A = torch.stack([pull(w[None]).flatten() for w in torch.eye(n - 1, dtype=F64)]).numpy()
         flat = z[i].flatten().numpy()
@@ -341,7 +346,7 @@ def test_a_ball_that_shrinks_along_the_horizon_is_never_left_through_its_centre(
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 def test_from_an_unsafe_start_a_chain_over_a_half_space_asks_for_recovery(dtype):
-    g = chain(Affine(vec(-1.0), num(0.0)), 0.5)  # h = x
+    g = chain(HalfSpace(vec(-1.0), num(0.0)), 0.5)  # h = x
     z = vec(-4.0, -3.0, -3.0, 1.0).reshape(1, 4, 1).to(dtype)
     x = project(g.to(z), z, pin(z, 0))
     torch.testing.assert_close(
@@ -377,10 +382,10 @@ def test_a_path_that_rests_at_the_centre_leaves_along_the_first_axis():
 def test_a_chain_over_an_ellipsoid_that_differs_by_plan_falls_back_plan_by_plan():
     level = LEVELS["outside ellipsoid"]
     z = normal(0, 2, 3, 2)
-    both = Constraint((Chain("c", moving(level, 0, 2, 3), 0.4),))
+    both = Constraint((DiscreteBarrier("c", moving(level, 0, 2, 3), 0.4),))
     x = free_projection(both, z)
     assert float(both(x).max()) <= 1e-5  # what the fallback promises
-    alone = free_projection(both.take(torch.tensor([1])), z[1:2])
+    alone = free_projection(both.select(torch.tensor([1])), z[1:2])
     torch.testing.assert_close(x[1:2], alone, atol=1e-6, rtol=0)
 
 
@@ -392,8 +397,8 @@ def test_rows_of_which_only_the_function_is_known_take_a_frame_too():
 
 def test_a_quadric_in_many_frames_stays_one_quadric():
     level = LEVELS["general quadric"].pull_back(*frame(0, (3, HORIZON)))
-    assert isinstance(level, Framed)
-    assert moved(level, torch.zeros(1)).quadric.P.dtype == torch.float32
+    assert isinstance(level, QuadricInFrame)
+    assert converted(level, torch.zeros(1)).quadric.P.dtype == torch.float32
     z = normal(0, 3, HORIZON, 2)
     torch.testing.assert_close(level.multiplied_out()(z), level(z), atol=1e-10, rtol=1e-10)
     assert isinstance(LEVELS["general quadric"].pull_back(vec(0.0, 1.0), vec(1.0, 2.0)), Quadric)

@@ -6,13 +6,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.spec.kinds import Dcbf
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import has_exact_form, project
 from cdiff_cli.projection.solvers.isotonic import SHORT, pool_violators
 from cdiff_cli.sampling.safediffuser import jacobian
@@ -38,7 +38,7 @@ QP = 1e-6  # ProxQP's own accuracy
 
 
 def high(level, alpha, alpha2):
-    return Constraint((Chain("c", level, alpha, alpha2),))
+    return Constraint((DiscreteBarrier("c", level, alpha, alpha2),))
 
 
 # short chains ---------------------------------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ def test_weights_by_plan_are_those_of_each_plan_in_long_chains_too(seed, alpha):
 @pytest.mark.parametrize("level", [half_space(), ball(1)])
 def test_a_chain_that_holds_already_comes_back_bit_for_bit(level):
     z = normal(0, 1, 1, 2).expand(2, 6, 2) + vec(-9.0, 9.0)
-    g = Constraint((Chain("c", level, 0.5),))
+    g = Constraint((DiscreteBarrier("c", level, 0.5),))
     assert float(g(z).max()) < 0
     assert torch.equal(project(g, z, pin(z, 0)), z)
 
@@ -93,7 +93,7 @@ def test_a_chain_that_holds_already_comes_back_bit_for_bit(level):
 
 def test_rows_by_hand():
     """h = 4, 3, 2, 0: psi = h' - .5 h = 1, .5, -1; rows = .2 psi - psi'."""
-    g = high(Affine(vec(-1.0), num(0.0)), 0.5, 0.8)
+    g = high(HalfSpace(vec(-1.0), num(0.0)), 0.5, 0.8)
     x = vec(4.0, 3.0, 2.0, 0.0).reshape(1, 4, 1)
     torch.testing.assert_close(g(x), vec(-0.3, 1.1)[None], atol=1e-15, rtol=0)
     assert g.labels(4) == ["c@0-2", "c@1-3"]
@@ -133,7 +133,7 @@ def test_projection_over_a_half_space_agrees_with_proxqp(seed, alpha, alpha2, n,
     x = project(g, z, pins)
     assert torch.equal(x[:, pins.held], z[:, pins.held])
     for i in range(2):
-        J, offset = dense_jacobian(g.take(torch.tensor([i])), z[i : i + 1])
+        J, offset = dense_jacobian(g.select(torch.tensor([i])), z[i : i + 1])
         expected = qp_project(J, -offset, z[i].flatten().numpy(), pins.mask.flatten().numpy())
         np.testing.assert_allclose(
             x[i].flatten().numpy(), expected, atol=10 * QP
@@ -186,7 +186,7 @@ def test_a_plan_that_begins_well_stays_safe(seed, alpha, alpha2):
 @pytest.mark.parametrize("alpha", [1e-3, 0.3, 1.0])
 def test_long_high_order_chains_are_found_too(alpha):
     z = normal(0, 2, 200, 1).cumsum(1)
-    g = high(Affine(vec(-1.0), num(0.0)), alpha, alpha)
+    g = high(HalfSpace(vec(-1.0), num(0.0)), alpha, alpha)
     x = project(g, z, pin(z, 0))
     assert float(g(x).max()) <= 1e-6  # what project promises
     again = project(g, x, pin(x, 0))
@@ -255,11 +255,11 @@ def test_the_look_ahead_is_projected_onto_by_place_and_velocity_together(seed):
 
 def test_segments_ask_for_the_barrier_of_the_place_itself():
     first, second = leading().parts[0].on_segments()
-    assert isinstance(first, Chain)
-    assert isinstance(second, Segments)
+    assert isinstance(first, DiscreteBarrier)
+    assert isinstance(second, OnSegments)
     assert second.level is first.level
     first, second = leading(WALL, {"time": 0.5, "velocity": {"x": "vx"}}).parts[0].on_segments()
-    assert isinstance(second, Waypoints)
+    assert isinstance(second, AtWaypoints)
     assert second.level is first.level
 
 

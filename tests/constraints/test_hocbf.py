@@ -5,16 +5,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.hocbf import Approach
+from cdiff_cli.constraints.hocbf import BallHOCBF
 from tests.problems import F64, normal, vec
 
 EYE, NONE, ORIGIN = torch.eye(2, dtype=F64), torch.zeros(2, 2, dtype=F64), vec(0.0, 0.0)
 seeds = st.integers(0, 10_000)
 
 
-def barrier(time: float = 0.5, centre=ORIGIN, drift=ORIGIN) -> Approach:
+def barrier(time: float = 0.5, centre=ORIGIN, drift=ORIGIN) -> BallHOCBF:
     """Outside the unit ball, of states (x, y, vx, vy)."""
-    return Approach(
+    return BallHOCBF(
         torch.cat((EYE, NONE), 1),
         centre,
         torch.cat((NONE, EYE), 1),
@@ -81,4 +81,4 @@ def test_a_path_that_keeps_psi_never_enters(seed, time):
 
 def test_shifted_it_keeps_further_away():
     x = normal(0, 7, 4)
-    torch.testing.assert_close(barrier().shift(0.2)(x), barrier()(x) + 0.2)
+    torch.testing.assert_close(barrier().tighten(0.2)(x), barrier()(x) + 0.2)

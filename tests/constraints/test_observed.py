@@ -6,13 +6,13 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.observed import Observed, require_bound
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.spec.load import enforced, file_model, json_schema, load_constraints
-from cdiff_cli.constraints.state_sets import Ellipsoid, Framed
+from cdiff_cli.constraints.state_sets import Ellipsoid, QuadricInFrame
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, SpecError
 from cdiff_cli.projection.project import project
 from cdiff_cli.yaml_files import Dumper
@@ -200,8 +200,8 @@ def test_what_is_asked_before_binding_is_done_after_it(case, seed, tmp_path_fact
         lambda c: pull_back(c, centre, scale),
         lambda c: pull_back(c.tighten(0.1), centre, scale),
         lambda c: enforced(kinds, c, "segments").tighten(0.1),
-        lambda c: Constraint(tuple(part.shift_level(0.1) for part in c.parts)),
-        lambda c: c.take(torch.tensor([1, 0])),
+        lambda c: Constraint(tuple(part.tighten_level(0.1) for part in c.parts)),
+        lambda c: c.select(torch.tensor([1, 0])),
     ):
         torch.testing.assert_close(
             change(g).bind(SEEN, DT, HORIZON)(x), change(now)(x), atol=1e-12, rtol=1e-12
@@ -212,7 +212,7 @@ def test_a_margin_of_the_barrier_is_one_of_h_whatever_alpha(tmp_path):
     """A calibrated margin: h >= 0.1 in place of h >= 0."""
     for entry in (CASES["barrier"], CASES["barrier"].replace("alpha: 0.3", "alpha: 0.3, order: 2")):
         _, g = load(tmp_path, entry)
-        (part,) = g.parts[0].shift_level(0.1).bind(SEEN, DT, HORIZON)
+        (part,) = g.parts[0].tighten_level(0.1).bind(SEEN, DT, HORIZON)
         plain = g.bind(SEEN, DT, HORIZON).parts[0]
         x = states(0)
         torch.testing.assert_close(part.level(x), plain.level(x) + 0.1, atol=1e-12, rtol=0)
@@ -223,10 +223,10 @@ def test_a_moving_ball_is_kept_on_segments_as_a_ball_whatever_its_form(tmp_path,
     kinds, g = load(tmp_path, CASES["squared ball"])
     part = enforced(kinds, g, safety).bind(SEEN, DT, HORIZON).parts[0]
     if safety == "waypoints":
-        assert isinstance(part, Waypoints)
-        assert isinstance(part.level, Framed)
+        assert isinstance(part, AtWaypoints)
+        assert isinstance(part.level, QuadricInFrame)
     else:
-        assert isinstance(part, Segments)
+        assert isinstance(part, OnSegments)
         assert isinstance(part.level, Ellipsoid)
         assert part.level.is_ball
 
@@ -386,4 +386,4 @@ def test_what_moves_says_so(tmp_path):
 
 
 def test_a_chain_is_what_a_barrier_compiles_to(tmp_path):
-    assert isinstance(bound(tmp_path, CASES["barrier"]).parts[0], Chain)
+    assert isinstance(bound(tmp_path, CASES["barrier"]).parts[0], DiscreteBarrier)

@@ -5,13 +5,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
+from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.spec.kinds import Dcbf
 from cdiff_cli.constraints.spec.sets import Linear, Quadratic
 from cdiff_cli.constraints.state_sets import Quadric, segment_max
 from cdiff_cli.constraints.trajectory import Constraint, pull_back, stack
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from tests.problems import (
     F64,
@@ -113,7 +113,7 @@ def test_pins_paint_their_values_and_free_nothing_else():
 
 
 def test_a_segment_through_a_ball_is_unsafe_though_both_its_ends_are_safe():
-    part = Waypoints("b", ball(1, centre=(0.0, 0.0), radius=1.0))
+    part = AtWaypoints("b", ball(1, centre=(0.0, 0.0), radius=1.0))
     x = vec(-3.0, 0.5, 3.0, 0.5).reshape(1, 2, 2)
     assert float(part(x).max()) < 0
     assert float(part.segment_max(x)) == pytest.approx(
@@ -210,7 +210,8 @@ def test_segment_max_bounds_every_point_of_the_segment_and_is_attained(name, see
 def test_a_chain_reports_its_barrier_along_segments(seed, alpha):
     x = normal(seed, 2, 4, 2)
     assert torch.equal(
-        Chain("c", ball(1), alpha).segment_max(x), Waypoints("w", ball(1)).segment_max(x)
+        DiscreteBarrier("c", ball(1), alpha).segment_max(x),
+        AtWaypoints("w", ball(1)).segment_max(x),
     )
 
 
@@ -227,8 +228,8 @@ def test_to_moves_dtype_and_keeps_values():
 
 def test_one_waypoint_has_a_segment_of_itself():
     x = normal(0, 2, 1, 2)
-    assert torch.equal(Waypoints("w", half_space()).segment_max(x), half_space()(x))
-    assert torch.equal(Chain("c", half_space(), 0.5).segment_max(x), half_space()(x))
+    assert torch.equal(AtWaypoints("w", half_space()).segment_max(x), half_space()(x))
+    assert torch.equal(DiscreteBarrier("c", half_space(), 0.5).segment_max(x), half_space()(x))
 
 
 # quadrics that are ellipsoids -----------------------------------------------------------------------------------------

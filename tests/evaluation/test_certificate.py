@@ -6,14 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import stack
 from cdiff_cli.evaluation.certificate import Saved, certificate, content_sha256, summary
 from tests.problems import ball, chain, num, opaque, vec, waypoints
 
 TASK = SimpleNamespace(name="plane", layout=("x", "y"), dt=0.5)
 DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "disc")
-LEFT = waypoints(Affine(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
+LEFT = waypoints(HalfSpace(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
 CUT = np.array(
     [[[-3.0, 0.6], [-2.0, 0.6], [2.0, 0.6], [3.0, 0.6]]]
 )  # safe waypoints; the middle segment is 0.4 deep in the disc
@@ -120,7 +120,7 @@ def test_a_tie_never_names_a_safe_waypoint_as_the_place_of_a_violation():
 def test_a_chain_is_judged_by_its_steps_and_between_waypoints_by_its_barrier():
     """h = 1 - x with alpha 0.5: from h = 1 to 0.25 loses too much, yet h stays positive; the step leads to waypoint 1."""
     (entry,) = certify(
-        chain(Affine(vec(1.0, 0.0), num(1.0)), 0.5), [[[0.0, 0.0], [0.75, 0.0], [0.75, 0.0]]]
+        chain(HalfSpace(vec(1.0, 0.0), num(1.0)), 0.5), [[[0.0, 0.0], [0.75, 0.0], [0.75, 0.0]]]
     )["entries"]
     assert entry["status"] == "unsafe at waypoints"
     assert (

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.conformal import (
     PASSES,
@@ -64,7 +64,7 @@ def test_the_error_of_an_episode_is_the_worst_near_the_limit():
 
 def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
     parts = [
-        Waypoints(name, Affine(vec(1.0), torch.tensor(3.0, dtype=torch.float64)))
+        AtWaypoints(name, HalfSpace(vec(1.0), torch.tensor(3.0, dtype=torch.float64)))
         for name in ("near", "other")
     ]
     g = tightened(Constraint(tuple(parts)), {"near": 0.25})

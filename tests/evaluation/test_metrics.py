@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, stack
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.evaluation.metrics import (
     acceleration,
@@ -29,7 +29,7 @@ from tests.problems import ball, chain, num, vec, waypoints
 
 XY = (0, 1)
 DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "disc")
-LEFT = waypoints(Affine(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
+LEFT = waypoints(HalfSpace(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
 BOX = np.array([[0.0, 0.0, 1.0, 1.0]])
 
 
@@ -200,7 +200,7 @@ def test_rollout_metrics_stop_where_the_episode_stops():
 
 
 def test_rollout_metrics_of_a_chain_count_states_beyond_the_barrier_not_rows():
-    g = chain(Affine(vec(1.0, 0.0), num(1.0)), 0.5)  # h = 1 - x
+    g = chain(HalfSpace(vec(1.0, 0.0), num(1.0)), 0.5)  # h = 1 - x
     x = np.array([[(0.0, 0.0), (0.9, 0.0), (1.2, 0.0), (np.nan, np.nan)]])
     (row,) = rollout_metrics(g, x, np.zeros((1, 3)), np.array([0]), np.array([0.0]))
     assert row["executed_violation"] == pytest.approx(0.4 + 0.25)  # 0.5 * 1 - 0.1,  0.5 * 0.1 + 0.2
@@ -226,7 +226,7 @@ def test_plan_metrics_measure_each_plan_in_the_tasks_columns():
         dt=1.0,
         walls=lambda: BOX,
     )
-    g = Constraint((Waypoints("left", Affine(vec(1.0, 0.0, 0.0, 0.0), num(1.0))),))
+    g = Constraint((AtWaypoints("left", HalfSpace(vec(1.0, 0.0, 0.0, 0.0), num(1.0))),))
     x = np.zeros((2, 2, 4))
     x[0] = [(-1.0, 0.5, 0.0, 0.0), (2.0, 0.5, 3.0, 0.0)]
     units = SimpleNamespace(violation=10.0, distance_power=2.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.dynamics import split
 from cdiff_cli.constraints.observed import Observed
 from cdiff_cli.constraints.pins import Pins
@@ -31,7 +31,7 @@ CPU = torch.device("cpu")
 
 def resolved(file, method):
     file = CONSTRAINTS / f"{file}.yaml"
-    return resolve(Options(task="maze2d-umaze", constraints=file, method=method, n=2, steps=4))
+    return resolve(Request(task="maze2d-umaze", constraints=file, method=method, n=2, steps=4))
 
 
 def twice(work):

@@ -8,7 +8,7 @@ from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.networks import ResidualMlp
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.training.inverse_dynamics import fit_inverse
-from cdiff_cli.training.windows import Windows, fit_frame
+from cdiff_cli.training.windows import Windows, fit_residual_normaliser
 from tests.problems import F64, normal
 
 LAYOUT = ("x", "y", "v")
@@ -25,8 +25,8 @@ def episode(seed: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(x), u
 
 
-WINDOWS = Windows.of([episode(seed, 200)[0] for seed in range(4)], 8)
-FRAME = fit_frame(WINDOWS, LAYOUT, (("x", "y"),), ("x",))
+WINDOWS = Windows.from_episodes([episode(seed, 200)[0] for seed in range(4)], 8)
+FRAME = fit_residual_normaliser(WINDOWS, LAYOUT, (("x", "y"),), ("x",))
 
 
 def windows(n: int = 50) -> torch.Tensor:
@@ -54,7 +54,9 @@ def test_what_follows_from_the_present_state_alone_is_in_the_frame():
     for _ in range(7):
         x.append(x[-1] @ torch.from_numpy(A).T)
     every = torch.stack(x, 1)
-    some = fit_frame(Windows.of(list(every[:30].numpy()), 8), LAYOUT, (), ())
+    some = fit_residual_normaliser(
+        Windows.from_episodes(list(every[:30].numpy()), 8), LAYOUT, (), ()
+    )
     torch.testing.assert_close(some.at(every[30:, 0]).centre[:, 1:], every[30:, 1:])
 
 

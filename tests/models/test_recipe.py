@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.recipe import Preset, Recipe
 from cdiff_cli.models.schedule import Schedule
@@ -38,7 +38,7 @@ def test_a_preset_may_name_every_kernel():
 
 @pytest.mark.usefixtures("fast")
 def test_a_preset_with_steps_plans_in_that_many_calls():
-    resolved = resolve(Options(preset="fast", n=1))
+    resolved = resolve(Request(preset="fast", n=1))
     assert (resolved.kernel, resolved.problem.schedule) == (
         "dpm++2m",
         Schedule.cosine(64).respaced(6),
@@ -51,13 +51,13 @@ def test_a_preset_with_steps_plans_in_that_many_calls():
 
 @pytest.mark.usefixtures("fast")
 def test_steps_of_the_command_win_over_those_of_the_preset():
-    resolved = resolve(Options(preset="fast", steps=9))
+    resolved = resolve(Request(preset="fast", steps=9))
     assert resolved.problem.schedule == Schedule.cosine(64).respaced(9)
     assert resolved.row()["preset"] == "fast*"
 
 
 def test_a_preset_without_steps_takes_all_as_trained():
-    assert resolve(Options()).problem.schedule == Schedule.cosine(64)
+    assert resolve(Request()).problem.schedule == Schedule.cosine(64)
 
 
 def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
@@ -70,7 +70,7 @@ def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
     with pytest.raises(
         CdiffError, match=r'^preset "fast", steps: expected 1 to 64 \(as trained\), found 100$'
     ):
-        resolve(Options(preset="fast"))
+        resolve(Request(preset="fast"))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdiff_cli.commands.resolve import Options, needed_speed, parse_settings, resolve
+from cdiff_cli.commands.resolve import Request, needed_speed, parse_settings, resolve
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.planning.execution import follow
 from cdiff_cli.planning.open_loop import plan
@@ -17,7 +17,7 @@ from cdiff_cli.tasks import load_task
 
 @pytest.fixture(scope="module")
 def umaze():
-    return resolve(Options(n=2))
+    return resolve(Request(n=2))
 
 
 def test_a_plan_of_a_seed_does_not_depend_on_its_batch(umaze):
@@ -59,7 +59,7 @@ def test_a_start_outside_the_constraints_is_refused(umaze):
 
 
 def test_random_pairs_are_free_allowed_and_within_the_data_speed():
-    resolved = resolve(Options(n=20, random=True))
+    resolved = resolve(Request(n=20, random=True))
     task, card = resolved.problem.task, resolved.checkpoint.card
     for start, goal in zip(resolved.problem.start, resolved.problem.goal, strict=True):
         assert task.is_free(start[:2], 0.1)

@@ -8,12 +8,12 @@ import torch
 import yaml
 
 from cdiff_cli.commands.plan import plan_run
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.verify import verify_run
 from cdiff_cli.constraints.dynamics import dynamics_of
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, SpecError
 from cdiff_cli.evaluation.metrics import hits_wall
 from cdiff_cli.models.checkpoint import load_checkpoint, read_safetensors, save_checkpoint
@@ -60,7 +60,7 @@ def constraints(tmp_path_factory):
 @pytest.fixture(scope="module")
 def resolved(checkpoint, constraints):
     return resolve(
-        Options(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints)
+        Request(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints)
     )
 
 
@@ -141,14 +141,14 @@ def test_fit_without_dynamics_in_the_checkpoint_is_refused_with_its_line(
         SpecError,
         match=r"own\.yaml:\d+ constraints\[1\]\.fit: the checkpoint has no linear dynamics",
     ):
-        resolve(Options(checkpoint=path, constraints=constraints))
+        resolve(Request(checkpoint=path, constraints=constraints))
 
 
 def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolved):
     """The goal obeys the constraint by a millimetre, less than what plans keep while they are made."""
     ceiling = torch.tensor(resolved.problem.goal[1] + 1e-3, dtype=torch.float64)
-    level = Affine(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling)
-    g = Constraint((Waypoints("near", level),))
+    level = HalfSpace(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling)
+    g = Constraint((AtWaypoints("near", level),))
     problem = replace(
         resolved.problem,
         g=g,
@@ -162,8 +162,8 @@ def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolve
 def test_a_start_closer_to_the_boundary_than_the_clearance_does_not_cost_the_goal(resolved, plans):
     """No plan is 5 mm inside a step after a start that is a millimetre inside: the polish takes one that is inside at all."""
     floor = torch.tensor(1e-3 - resolved.problem.start[1], dtype=torch.float64)
-    near = Waypoints(
-        "near", Affine(torch.tensor([0.0, -1.0, 0.0, 0.0], dtype=torch.float64), floor)
+    near = AtWaypoints(
+        "near", HalfSpace(torch.tensor([0.0, -1.0, 0.0, 0.0], dtype=torch.float64), floor)
     )
     problem = replace(
         resolved.problem, enforced=Constraint((near, *dynamics_of(resolved.problem.enforced)))
@@ -202,7 +202,7 @@ def careful(resolved, checkpoint, constraints, monkeypatch):
     task = Careful(**{f.name: getattr(UMAZE, f.name) for f in fields(UMAZE)})
     monkeypatch.setattr("cdiff_cli.commands.resolve.load_task", lambda _: task)
     return resolve(
-        Options(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints)
+        Request(n=2, method="projected", steps=8, checkpoint=checkpoint, constraints=constraints)
     )
 
 
@@ -216,8 +216,8 @@ def test_a_task_keeps_its_own_clearance(resolved, careful, plans):
     """A ceiling that the plans cross by 2 cm and less."""
     z = torch.from_numpy(plans.x)
     ceiling = z[..., 1].max() - 0.02
-    near = Waypoints(
-        "near", Affine(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling)
+    near = AtWaypoints(
+        "near", HalfSpace(torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64), ceiling)
     )
     assert float(near(z).max()) > 0.0
     for kept, clearance in ((resolved, 5e-3), (careful, 0.05)):

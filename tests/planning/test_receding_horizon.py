@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from cdiff_cli.constraints.observed import Observed
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.networks import InverseDynamics
-from cdiff_cli.models.normaliser import Frame, Normaliser
+from cdiff_cli.models.normaliser import Normaliser, ResidualNormaliser
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.episodes import Episodes
 from cdiff_cli.planning.receding_horizon import Controller, control
-from cdiff_cli.planning.warm_start import Resumed
+from cdiff_cli.planning.warm_start import CarriedMultipliers
 from cdiff_cli.sampling.baselines import BestOf
 from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
 from tests.problems import F64, chain, vec
@@ -88,11 +88,11 @@ def inverse() -> InverseDynamics:
     return net.requires_grad_(False)
 
 
-def frame() -> Frame:
+def frame() -> ResidualNormaliser:
     """Windows that speed up by 0.1 a step: their mean is the plan."""
     k = torch.arange(H, dtype=F64)
     mean = torch.stack((torch.zeros(H, dtype=F64), 0.1 * k), 1)
-    return Frame(
+    return ResidualNormaliser(
         Normaliser(vec(0.0, 0.0), vec(1.0, 1.0)),
         torch.tensor([False, True]),
         mean,
@@ -105,7 +105,7 @@ def mean_window(x: torch.Tensor, t: int) -> torch.Tensor:
     return torch.cat((x[:, :1], torch.zeros_like(x[:, 1:])), 1)
 
 
-LIMIT = chain(Affine(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5)
+LIMIT = chain(HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5)
 FREE = Controller(
     task=MassTask(),  # type: ignore[arg-type]
     denoiser=mean_window,
@@ -223,7 +223,9 @@ def test_metrics_of_an_episode():
 
 def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
     """The present state may be unsafe: what can still move is made safe, with no error."""
-    held = Constraint((Waypoints("speed", Affine(vec(0.0, 1.0), torch.tensor(0.01, dtype=F64))),))
+    held = Constraint(
+        (AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), torch.tensor(0.01, dtype=F64))),)
+    )
     done = control(
         replace(FREE, method=Projected(), polish=True, g=held, enforced=held), [0], steps=5
     )
@@ -233,8 +235,8 @@ def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
 
 def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     """Two bounds that exclude each other; the brake takes a tenth of the speed."""
-    narrow = (Waypoints("low", Affine(vec(0.0, 1.0), torch.tensor(0.2, dtype=F64))),)
-    narrow += (Waypoints("high", Affine(vec(0.0, -1.0), torch.tensor(-0.4, dtype=F64))),)
+    narrow = (AtWaypoints("low", HalfSpace(vec(0.0, 1.0), torch.tensor(0.2, dtype=F64))),)
+    narrow += (AtWaypoints("high", HalfSpace(vec(0.0, -1.0), torch.tensor(-0.4, dtype=F64))),)
     never = Constraint(narrow)
     acting = replace(
         FREE, method=Projected(), polish=True, g=never, enforced=never, brake=lambda x: -x[1:]
@@ -291,7 +293,7 @@ def observed_limit() -> Constraint:
     """v <= 0.75, told anew at each step."""
 
     def make(seen, dt, horizon):
-        return Waypoints("speed", Affine(vec(0.0, 1.0), 0.75 + 0 * seen["clock"][:, None]))
+        return AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), 0.75 + 0 * seen["clock"][:, None]))
 
     return Constraint((Observed("speed", ("clock",), make),))
 
@@ -306,7 +308,7 @@ def test_a_warm_plan_that_no_longer_obeys_what_is_observed_is_made_anew():
         np.testing.assert_array_equal(done.calls[i, 2:], [3 if start > 0.05 else 1, 3, 3])
     same(done, control(acting, [4], steps=5), slice(4, 5))
     assert len(set(done.calls[:, 2])) == 2  # some of them together, some not
-    known = Constraint((Waypoints("speed", Affine(vec(0.0, 1.0), vec(0.75).squeeze())),))
+    known = Constraint((AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze())),))
     for other in (
         replace(acting, g=known, enforced=known),
         replace(acting, method=Unconstrained(), polish=False),
@@ -338,8 +340,10 @@ def test_multipliers_go_on_from_plan_to_plan_where_that_is_asked_those_of_each_e
     control(replace(FREE, method=kept, resume=True), [0], steps=2)
     assert fresh.begun == [[0], [1], [2]] * 2
     assert kept.begun == [[0], [1], [2], [3], [4], [5]]
-    resumed = Resumed(Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1))
-    some = Resumed(Counting(), 0, resumed.of(np.array([True, False, True])))
+    resumed = CarriedMultipliers(
+        Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1)
+    )
+    some = CarriedMultipliers(Counting(), 0, resumed.select(np.array([True, False, True])))
     assert some.init(torch.zeros(2, H, 2), LIMIT)[:, 0].tolist() == [1, 3]
 
 
@@ -349,7 +353,7 @@ def test_the_safest_of_k_plans_is_executed():
     def noisy(x: torch.Tensor, t: int) -> torch.Tensor:
         return x
 
-    low = chain(Affine(vec(0.0, 1.0), vec(0.1).squeeze()), 0.5)
+    low = chain(HalfSpace(vec(0.0, 1.0), vec(0.1).squeeze()), 0.5)
     acting = replace(FREE, denoiser=noisy, g=low, enforced=low)
     one, many = (control(replace(acting, method=BestOf(k)), [0, 1, 2], steps=4) for k in (1, 16))
     assert many.violation[:, :4].mean() < 0.7 * one.violation[:, :4].mean()
@@ -375,7 +379,9 @@ def test_a_candidate_that_is_not_finite_is_not_kept():
 )
 def test_rows_as_one_matrix_give_the_plans_that_part_by_part_gives(method, monkeypatch):
     """To 1e-6: the order of additions in float32 differs."""
-    both = Constraint((*LIMIT.parts, *chain(Affine(vec(0.0, -1.0), vec(0.2).squeeze()), 0.3).parts))
+    both = Constraint(
+        (*LIMIT.parts, *chain(HalfSpace(vec(0.0, -1.0), vec(0.2).squeeze()), 0.3).parts)
+    )
     acting = replace(FREE, method=method, g=both, enforced=both, polish=True)
     assert acting.condensed is not None
     fast = control(acting, [0, 1, 2])

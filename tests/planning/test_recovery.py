@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.planning.receding_horizon import control
@@ -40,7 +40,7 @@ class Begins:
 
 def acted(name, method, begin, steps):
     """(levels f of the executed states, unsafe above 0 [n, steps + 1], metrics of each episode)."""
-    acting = controller(resolve(Options(task=name, method=method, n=len(SEEDS), device="cpu")))
+    acting = controller(resolve(Request(task=name, method=method, n=len(SEEDS), device="cpu")))
     acting = replace(acting, task=Begins(acting.task, begin))
     done = control(acting, SEEDS, steps=steps)
     assert not done.diverged.any()
@@ -107,7 +107,7 @@ BEYOND = {
 
 def acted_from(case, method):
     name, rate = BEYOND[case]
-    task = resolve(Options(task=name, n=1, device="cpu")).problem.task
+    task = resolve(Request(task=name, n=1, device="cpu")).problem.task
     return acted(name, method, turning(task, rate), 20)
 
 

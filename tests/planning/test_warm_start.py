@@ -4,18 +4,18 @@ import pytest
 import torch
 
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
-from cdiff_cli.planning.warm_start import Resumed
-from cdiff_cli.projection.segments import turned
+from cdiff_cli.constraints.waypoints import AtWaypoints
+from cdiff_cli.planning.warm_start import CarriedMultipliers
+from cdiff_cli.projection.segments import with_tangent_planes
 from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
 from cdiff_cli.sampling.sampler import Step
 from tests.problems import F64, ball, half_space, normal
 
 H = 5
 G = Constraint(
-    (Segments("ball", ball(1)), Waypoints("wall", half_space()))
+    (OnSegments("ball", ball(1)), AtWaypoints("wall", half_space()))
 )  # 4 segments, 5 waypoints
 NOISY = {"expected": [101, 102, 103, 0, *(105, 106, 107, 108, 0)], "n": 9}  # in the order of g
 PLANES = {
@@ -29,7 +29,7 @@ def carried(method, last, steps=1):
     """The multipliers that a plan begins with, after one that ended with `last`."""
     state = method.init(torch.zeros(1, H, 2, dtype=F64), G)
     ended = AlmState(last, 0.9) if isinstance(state, AlmState) else last
-    begun = Resumed(method, steps, ended).init(torch.zeros(1, H, 2, dtype=F64), G)
+    begun = CarriedMultipliers(method, steps, ended).init(torch.zeros(1, H, 2, dtype=F64), G)
     if isinstance(begun, AlmState):
         assert begun.rho == method.rho
         return begun.lam
@@ -59,7 +59,7 @@ def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(kind, o
     x = normal(0, 1, H, 2) * 0.1 + torch.tensor(
         [0.3, 3.0], dtype=F64
     )  # far from the ball, within the wall
-    g = turned(G, x, Pins.none(x)) if on == "clean" else G
+    g = with_tangent_planes(G, x, Pins.none(x)) if on == "clean" else G
     at = (4 if on == "noisy" else 0) + 3
     last = torch.zeros(1, g(x).shape[1], dtype=F64)
     last[0, at] = 100.0

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.project import project
 from cdiff_cli.projection.solvers.isotonic import pool_violators
@@ -219,7 +219,7 @@ def test_an_end_below_zero_out_of_reach_is_refused(dtype):
     z = torch.ones(1, 384, 1, dtype=dtype)
     z[0, -1] = -1.0  # h = x: the start would have to lie below -0.15^-383
     with pytest.raises(InfeasibleError):
-        project(chain(Affine(vec(-1.0), num(0.0)), 0.85).to(z), z, pin(z, -1))
+        project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.85).to(z), z, pin(z, -1))
 
 
 def test_one_block_may_reach_further_than_gamma_has_powers():

@@ -9,16 +9,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.dynamics import LinearDynamics, Reachable, dynamics_of, split
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.dynamics import (
+    LinearDynamics,
+    LinearDynamicsConstraint,
+    dynamics_of,
+    split,
+)
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate, limits
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.rate import RateLimit, rate_bounds
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.projection.dynamics import nearest_reachable
+from cdiff_cli.projection.dynamics import project_dynamics
 from cdiff_cli.projection.project import project, project_reachable
 from cdiff_cli.training.system_identification import fit
 from tests.problems import F64, ball, normal, num, pin, saddle, vec
@@ -50,7 +55,7 @@ def maze(bound=1.0):
 def reachable(dynamics, tolerance=1e-5, weight=None):
     n = len(dynamics.c)
     one = torch.ones(n, dtype=F64)
-    return Reachable(
+    return LinearDynamicsConstraint(
         "dyn",
         dynamics,
         torch.zeros(n, dtype=F64),
@@ -76,7 +81,7 @@ def solve(dynamics, z, pins, parts=(), rounds=3000, used=(0, 1), **more):
         "rounds": rounds,
         "tolerance": 1e-9,
     }
-    return nearest_reachable(dynamics, parts, more.pop("rest", None), z, pins, **(settings | more))
+    return project_dynamics(dynamics, parts, more.pop("rest", None), z, pins, **(settings | more))
 
 
 def distance(x, z):
@@ -160,7 +165,7 @@ def test_rows_of_reachable_are_one_a_step_and_count_from_the_tolerance():
     x = torch.stack((vec(0.0, 0.0), vec(1.0, -0.5), vec(0.5, -0.5)))[None]
     torch.testing.assert_close(part(x), vec(1.25**0.5 - 0.25, -0.25)[None], atol=1e-12, rtol=0)
     assert part.labels(3) == ["dyn@0-1", "dyn@1-2"]
-    assert torch.equal(part.shift(0.125)(x), part(x) + 0.125)
+    assert torch.equal(part.tighten(0.125)(x), part(x) + 0.125)
     assert torch.equal(part.segment_max(x), part(x))
     assert part.on_segments() == (part,)
 
@@ -282,7 +287,7 @@ def test_with_tight_bounds_and_a_half_space_it_is_the_solution_of_proxqp(horizon
         else max(float(along.max()) - 0.003, float(along[0]) + 1e-6)
     )
     x, warm = solve(
-        d, z, pin(z, *pinned), [Waypoints("wall", Affine(a[:2], num(b)))] if wall else []
+        d, z, pin(z, *pinned), [AtWaypoints("wall", HalfSpace(a[:2], num(b)))] if wall else []
     )
     expected = qp(d, z[0], pinned, a if wall else None, b)
     torch.testing.assert_close(distance(x[0], z[0]), distance(expected, z[0]), atol=0, rtol=QP)
@@ -296,7 +301,7 @@ def test_every_iterate_obeys_the_dynamics(rounds):
     d = maze()
     _, z = noisy_path(d, 0, 3, 16)
     x, warm = solve(
-        d, z, pin(z, 0), [Segments("s", ball(1, centre=(0.1, 0.0), radius=0.2))], rounds=rounds
+        d, z, pin(z, 0), [OnSegments("s", ball(1, centre=(0.1, 0.0), radius=0.2))], rounds=rounds
     )
     torch.testing.assert_close(
         x, d.rollout(z[:, 0], warm.u), atol=1e-12, rtol=0
@@ -304,7 +309,7 @@ def test_every_iterate_obeys_the_dynamics(rounds):
 
 
 def test_a_batch_is_solved_as_each_alone():
-    d, part = maze(), Waypoints("w", Affine(vec(1.0, 0.5), num(0.3)))
+    d, part = maze(), AtWaypoints("w", HalfSpace(vec(1.0, 0.5), num(0.3)))
     _, z = noisy_path(d, 5, 4, 12)
     z[:, 0, :2] -= 0.6
     whole, _ = solve(d, z, pin(z, 0), [part], rounds=200, tolerance=0.0)
@@ -315,7 +320,7 @@ def test_a_batch_is_solved_as_each_alone():
 
 
 def test_going_on_from_where_it_stopped_reaches_the_same_point():
-    d, part = maze(), Waypoints("w", Affine(vec(1.0, 0.5), num(0.0)))
+    d, part = maze(), AtWaypoints("w", HalfSpace(vec(1.0, 0.5), num(0.0)))
     _, z = noisy_path(d, 6, 2, 16)
     z[:, 0, :2] = -0.05
     once, _ = solve(d, z, pin(z, 0), [part], rounds=1000)
@@ -331,7 +336,7 @@ def test_going_on_from_where_it_stopped_reaches_the_same_point():
 @pytest.mark.parametrize("batch", [0, 2])
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_short_horizons_and_empty_batches_pass(batch, horizon):
-    g = Constraint((reachable(maze()), Segments("s", ball(1, dim=4))))
+    g = Constraint((reachable(maze()), OnSegments("s", ball(1, dim=4))))
     z = normal(0, batch, horizon, 4) + 3.0
     assert project(g, z, pin(z, 0)).shape == z.shape
 
@@ -352,7 +357,7 @@ def trip(horizon=64, length=0.8):
 @pytest.mark.parametrize("dtype", [F64, torch.float32])
 def test_a_disc_on_the_way_is_avoided_on_segments_within_the_inputs(dtype):
     z = trip()
-    disc = Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))
+    disc = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))
     assert float(disc(z).max()) > 0.05
     g = Constraint((reachable(maze(), weight=WEIGHT), disc)).to(z.to(dtype))
     z = z.to(dtype)
@@ -372,7 +377,7 @@ def test_a_pulled_back_projection_is_the_pulled_back_result():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     x = project(g, z, pin(z, 0, 63))
@@ -388,7 +393,7 @@ def test_a_trajectory_that_obeys_all_stays():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            Segments("disc", ball(1, centre=(0.0, 1.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball(1, centre=(0.0, 1.0), radius=0.12, dim=4)),
         )
     )
     torch.testing.assert_close(project(g, z, pin(z, 0, 63)), z, atol=1e-6, rtol=0)
@@ -410,9 +415,9 @@ def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
 @pytest.mark.parametrize(
     "other",
     [
-        Chain("c", Affine(vec(0.0, 0.0, 1.0, 0.0), num(2.0)), 0.3),
-        Waypoints("q", ball(-1, centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
-        Waypoints(
+        DiscreteBarrier("c", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.0)), 0.3),
+        AtWaypoints("q", ball(-1, centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
+        AtWaypoints(
             "s",
             replace(
                 saddle(), P=torch.diag(vec(1.0, -1.0, 0.0, 0.0)), q=vec(0.2, 0, 0, 0), r=num(0.14)
@@ -436,9 +441,9 @@ def test_a_chain_a_disc_and_a_wall_hold_at_once():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
-            Waypoints("wall", Affine(vec(0.0, 1.0, 0.0, 0.0), num(0.2))),
-            Chain("slow", Affine(vec(0.0, 0.0, 1.0, 0.0), num(2.3)), 0.3),
+            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            AtWaypoints("wall", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.2))),
+            DiscreteBarrier("slow", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.3)), 0.3),
         )
     )
     x, _ = project_reachable(g, z, pin(z, 0, 63), None, 1e-3)
@@ -451,10 +456,10 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
     """The limit has no half-spaces at waypoints: its own projection (rate.py) takes turns with the active set."""
     z = trip()
     one = torch.ones(4, dtype=F64)
-    slow = Rate(
+    slow = RateLimit(
         "slow",
         torch.eye(4, dtype=F64)[:2],
-        *limits(None, 2.3),
+        *rate_bounds(None, 2.3),
         True,
         0.01,
         torch.zeros_like(one),
@@ -464,7 +469,7 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
         (
             reachable(maze(), weight=WEIGHT),
             slow,
-            Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     assert float(slow(z).max()) > 0.3
@@ -484,6 +489,6 @@ def test_two_sets_of_dynamics_are_refused():
 
 
 def test_split_parts_the_dynamics_from_the_rest():
-    part, wall = reachable(maze()), Waypoints("w", Affine(vec(1.0, 0, 0, 0), num(0.0)))
+    part, wall = reachable(maze()), AtWaypoints("w", HalfSpace(vec(1.0, 0, 0, 0), num(0.0)))
     assert dynamics_of(Constraint((wall, part))) == [part]
     assert split(Constraint((wall, part))) == (Constraint((wall,)), Constraint((part,)))

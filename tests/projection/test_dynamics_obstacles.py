@@ -5,12 +5,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine
-from cdiff_cli.constraints.waypoints import Waypoints
-from cdiff_cli.projection.dynamics import nearest_reachable
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import HalfSpace
+from cdiff_cli.constraints.waypoints import AtWaypoints
+from cdiff_cli.projection.dynamics import project_dynamics
 from cdiff_cli.projection.segments import planes
-from cdiff_cli.projection.solvers.active_set import AGAIN, Bounds, _at_active, settle
+from cdiff_cli.projection.solvers.active_set import AGAIN, Bounds, _at_active
 from cdiff_cli.projection.solvers.lq_tracking import tracking
 from tests.problems import F64, ball, normal, num, pin, vec
 from tests.projection.test_dynamics import WEIGHT, distance, maze, noisy_path, qp, solve, trip
@@ -20,7 +20,7 @@ WALL = vec(1.0, 0.5, 0.0, 0.0)
 
 
 def wall(b):
-    return Waypoints("wall", Affine(WALL[:2], num(b)))
+    return AtWaypoints("wall", HalfSpace(WALL[:2], num(b)))
 
 
 @settings(max_examples=15, deadline=None)
@@ -91,14 +91,14 @@ def test_plans_that_are_safe_get_no_tangent_planes(monkeypatch):
         "cdiff_cli.projection.dynamics.planes",
         lambda parts, x, pins: asked.append(len(x)) or planes(parts, x, pins),
     )
-    x, _ = solve(d, z, pin(z, 0, 63), [Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))])
+    x, _ = solve(d, z, pin(z, 0, 63), [OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))])
     assert set(asked) == {1}
     torch.testing.assert_close(x[1], z[1], atol=1e-8, rtol=0)
 
 
 def test_later_choices_of_planes_come_nearer():
     d, z = maze(), trip()
-    part = Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))
+    part = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))
     far = [
         float(distance(solve(d, z, pin(z, 0, 63), [part], turns=turns)[0], z))
         for turns in (1, 2, 3)
@@ -126,7 +126,7 @@ def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_s
     """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
     d = maze(bound=0.3)
     z = trip()
-    near, far = (Segments("disc", ball(1, centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0))
+    near, far = (OnSegments("disc", ball(1, centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0))
     _, warm = solve(d, z, pin(z, 0, 63), [near])
     assert warm.soft.tolist() == [True]
     solved = []
@@ -152,8 +152,8 @@ def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give()
     d, z = maze(bound=1e6), torch.zeros(1, 3, 4, dtype=F64)
     z[:, 1:, 0] = 0.05
     walls = [
-        Waypoints("below", Affine(vec(1.0, 0.0), num(0.0))),
-        Waypoints("above", Affine(vec(-1.0, 0.0), num(-0.1))),
+        AtWaypoints("below", HalfSpace(vec(1.0, 0.0), num(0.0))),
+        AtWaypoints("above", HalfSpace(vec(-1.0, 0.0), num(-0.1))),
     ]
     x, warm = solve(d, z, pin(z, 0), walls)
     assert warm.soft.tolist() == [True]
@@ -166,7 +166,7 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
     d = maze()
     _, z = noisy_path(d, 9, 6, 40)
     z[:, 0, :2] -= 0.5
-    part = Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.2))
+    part = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.2))
     whole, _ = solve(d, z, pin(z, 0), [part, wall(0.3)])
     alone = torch.cat([solve(d, one[None], pin(one[None], 0), [part, wall(0.3)])[0] for one in z])
     torch.testing.assert_close(whole, alone, atol=1e-8, rtol=0)
@@ -178,9 +178,9 @@ def test_half_spaces_at_states_of_three_coordinates():
     _, z = noisy_path(d, 2, 2, 30)
     whole = vec(0.0, 0.3, 1.0, 0.2)
     b = float((z[:, 0] @ whole).max()) + 0.1
-    x, _ = nearest_reachable(
+    x, _ = project_dynamics(
         d,
-        [Waypoints("w", Affine(a, num(b)))],
+        [AtWaypoints("w", HalfSpace(a, num(b)))],
         None,
         z,
         pin(z, 0),
@@ -201,8 +201,8 @@ def test_what_has_no_rows_is_met_by_admm_around_the_active_set():
     d, z = maze(), trip()
     z[:, 0, 1] = 0.0
     upper, lower = (
-        Waypoints("u", Affine(vec(0.0, 1.0), num(0.04))),
-        Waypoints("l", Affine(vec(0.0, -1.0), num(0.04))),
+        AtWaypoints("u", HalfSpace(vec(0.0, 1.0), num(0.04))),
+        AtWaypoints("l", HalfSpace(vec(0.0, -1.0), num(0.04))),
     )
     expected, _ = solve(d, z, pin(z, 0), [upper, lower])
 

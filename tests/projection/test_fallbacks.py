@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.black_box import Opaque
-from cdiff_cli.constraints.state_sets import Affine, Quadric
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.black_box import BlackBox
+from cdiff_cli.constraints.state_sets import HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import Constraint, stack
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.infeasible import FILTERED
 from cdiff_cli.projection.project import project
@@ -35,7 +35,7 @@ def test_inside_a_ball_and_a_half_space_ends_on_both():
     g = stack(
         [
             waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0), "b"),
-            waypoints(Affine(vec(1.0, 0.0), num(0.6)), "h"),
+            waypoints(HalfSpace(vec(1.0, 0.0), num(0.6)), "h"),
         ]
     )
     x = free_projection(g, vec(3.0, 3.0).reshape(1, 1, 2))
@@ -72,7 +72,7 @@ def test_opaque_ball_falls_back_to_linearisation_and_agrees():
 def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
     z = torch.zeros(1, 3, 1, dtype=F64)
     z[0, :, 0] = vec(1.0, 1.0, 1.0)
-    total = Constraint((Opaque("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
+    total = Constraint((BlackBox("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
     x = project(total, z, pin(z, 0))
     torch.testing.assert_close(x.flatten(), vec(1.0, 0.0, 0.0), atol=QP, rtol=0)
 
@@ -85,8 +85,8 @@ def test_dcbf_over_an_ellipsoid_is_reached_by_linearisation():
 def test_two_half_spaces_that_exclude_each_other_are_named():
     g = stack(
         [
-            waypoints(Affine(vec(1.0, 0.0), num(-1.0)), "left"),
-            waypoints(Affine(vec(-1.0, 0.0), num(-1.0)), "right"),
+            waypoints(HalfSpace(vec(1.0, 0.0), num(-1.0)), "left"),
+            waypoints(HalfSpace(vec(-1.0, 0.0), num(-1.0)), "right"),
         ]
     )
     with pytest.raises(InfeasibleError, match=r"(left|right)@0.*over"):
@@ -95,8 +95,8 @@ def test_two_half_spaces_that_exclude_each_other_are_named():
 
 def _slab(name, low, high):
     """low <= x <= high, two parts."""
-    at_least, at_most = Affine(vec(-1.0, 0.0), num(-low)), Affine(vec(1.0, 0.0), num(high))
-    return Constraint((Waypoints(f"{name}.low", at_least), Waypoints(f"{name}.high", at_most)))
+    at_least, at_most = HalfSpace(vec(-1.0, 0.0), num(-low)), HalfSpace(vec(1.0, 0.0), num(high))
+    return Constraint((AtWaypoints(f"{name}.low", at_least), AtWaypoints(f"{name}.high", at_most)))
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
@@ -139,21 +139,21 @@ def test_a_pinned_violation_is_named(kind):
 def test_a_pinned_coordinate_that_alone_decides_a_row_is_named():
     z = torch.ones(1, 2, 2, dtype=F64)
     with pytest.raises(InfeasibleError, match="wall@1"):
-        project(waypoints(Affine(vec(1.0, 0.0), num(0.0)), "wall"), z, pin(z, 1, columns=[0]))
+        project(waypoints(HalfSpace(vec(1.0, 0.0), num(0.0)), "wall"), z, pin(z, 1, columns=[0]))
 
 
 def test_pinned_ends_that_contradict_a_chain_between_them_are_named():
     z = vec(3.0, 2.0, -1.0).reshape(1, 3, 1)  # h = x falls from 3 to -1: a chain never crosses 0
     with pytest.raises(InfeasibleError, match="c@1-2"):
-        project(chain(Affine(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0, 2))
+        project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0, 2))
 
 
 def test_two_neighbouring_pinned_waypoints_that_break_a_chain_are_refused():
     z = vec(3.0, 0.1, 0.0).reshape(1, 3, 1)
     g = Constraint(
         (
-            Chain("speed", Affine(vec(-1.0), num(0.0)), 0.5),
-            Waypoints("w", Affine(vec(1.0), num(9.0))),
+            DiscreteBarrier("speed", HalfSpace(vec(-1.0), num(0.0)), 0.5),
+            AtWaypoints("w", HalfSpace(vec(1.0), num(9.0))),
         )
     )
     with pytest.raises(InfeasibleError, match="pinned state violates speed@0-1"):

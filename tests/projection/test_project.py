@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Quadric
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import Constraint, stack
 from cdiff_cli.projection.project import project
-from cdiff_cli.projection.state import nearest
+from cdiff_cli.projection.state import project_state
 from tests.problems import (
     F64,
     KINDS,
@@ -53,7 +53,9 @@ EXACT = [
 
 
 def test_half_space_moves_along_its_normal():
-    x = free_projection(waypoints(Affine(vec(3.0, 4.0), num(0.0))), vec(3.0, 4.0).reshape(1, 1, 2))
+    x = free_projection(
+        waypoints(HalfSpace(vec(3.0, 4.0), num(0.0))), vec(3.0, 4.0).reshape(1, 1, 2)
+    )
     torch.testing.assert_close(x.flatten(), vec(0.0, 0.0), atol=1e-15, rtol=0)  # rounding
 
 
@@ -110,13 +112,13 @@ def test_rotated_quadric_of_deficient_rank_leaves_its_null_direction():
 
 def test_chain_of_two_under_gravity_of_the_first():
     # h = x; x' >= x / 2.  (2, 0): minimise (a - 2)^2 + (a / 2)^2, a = 1.6
-    x = free_projection(chain(Affine(vec(-1.0), num(0.0)), 0.5), vec(2.0, 0.0).reshape(1, 2, 1))
+    x = free_projection(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), vec(2.0, 0.0).reshape(1, 2, 1))
     torch.testing.assert_close(x.flatten(), vec(1.6, 0.8), atol=1e-14, rtol=0)
 
 
 def test_chain_from_a_pinned_start_only_raises_what_follows():
     z = vec(2.0, 0.0, 0.0).reshape(1, 3, 1)
-    x = project(chain(Affine(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0))
+    x = project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0))
     torch.testing.assert_close(x.flatten(), vec(2.0, 1.0, 0.5), atol=1e-14, rtol=0)
 
 
@@ -125,7 +127,7 @@ def test_chain_from_a_pinned_start_only_raises_what_follows():
 def test_chain_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon):
     z = normal(seed, 2, horizon, 2)
     x = free_projection(chain(half_space(), 1.0), z)
-    clipped = torch.cat((z[:, :1], nearest(half_space(), z[:, 1:])), 1)
+    clipped = torch.cat((z[:, :1], project_state(half_space(), z[:, 1:])), 1)
     torch.testing.assert_close(x, clipped, atol=1e-14, rtol=0)
 
 
@@ -218,7 +220,7 @@ def test_float32_projections_are_feasible_to_float32(kind):
 @given(seed=seeds)
 def test_half_space_agrees_with_proxqp(seed):
     a, z = normal(seed, 2), normal(seed + 1, 2, 3, 2)
-    g = waypoints(Affine(a, num(0.1)))
+    g = waypoints(HalfSpace(a, num(0.1)))
     torch.testing.assert_close(free_projection(g, z), qp_projection(g, z), atol=QP, rtol=0)
 
 
@@ -230,7 +232,7 @@ def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
     turn = 2.4 * torch.arange(n) + float(normal(seed + 1, 1))
     g = stack(
         [
-            waypoints(Affine(torch.stack((a.cos(), a.sin())).to(z), num(0.2)), f"w{i}")
+            waypoints(HalfSpace(torch.stack((a.cos(), a.sin())).to(z), num(0.2)), f"w{i}")
             for i, a in enumerate(turn)
         ]
     )
@@ -241,7 +243,7 @@ def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
 
 def test_a_half_space_and_a_chain_together_agree_with_proxqp():
     g, z = (
-        stack([chain(half_space(), 0.3), waypoints(Affine(vec(0.0, 1.0), num(0.1)))]),
+        stack([chain(half_space(), 0.3), waypoints(HalfSpace(vec(0.0, 1.0), num(0.1)))]),
         normal(7, 3, 5, 2),
     )
     torch.testing.assert_close(
@@ -287,7 +289,7 @@ def test_chain_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
 
 def test_half_space_moves_only_the_free_coordinate_of_a_pinned_state():
     z = vec(1.0, 0.0).reshape(1, 1, 2)
-    x = project(waypoints(Affine(vec(1.0, 1.0), num(0.0))), z, pin(z, 0, columns=[0]))
+    x = project(waypoints(HalfSpace(vec(1.0, 1.0), num(0.0))), z, pin(z, 0, columns=[0]))
     torch.testing.assert_close(x.flatten(), vec(1.0, -1.0), atol=QP, rtol=0)
 
 
@@ -314,7 +316,7 @@ def test_quadric_projection_is_the_nearest_boundary_point(name):
         torch.cat((normal(11, 60, 2, scale=1.5), vec(0.3, -0.2) + normal(12, 40, 2, scale=0.3))),
     )
     z = z[level(z) > 1e-3]
-    moved = (nearest(level, z) - z).norm(dim=-1)
+    moved = (project_state(level, z) - z).norm(dim=-1)
     best = nearest_of(_boundary(level), z)
     # the grid is 0.01 wide, so the cloud has a point within 0.0071 of the nearest one
     assert bool((moved <= best + 1e-8).all())
@@ -328,7 +330,7 @@ def test_projection_onto_a_random_indefinite_quadric_is_stationary(seed):
     level = Quadric((P + P.T) / 2, normal(seed + 1, 3), num(0.3))
     z = normal(seed + 2, 5, 3)
     z = z[level(z) > 0]
-    x = nearest(level, z)
+    x = project_state(level, z)
     n, d = level.gradient(x), z - x
     assert (
         float(level(x).abs().max() if len(x) else 0.0) <= 1e-6
@@ -342,7 +344,7 @@ def test_projection_onto_a_random_indefinite_quadric_is_stationary(seed):
 
 def test_saddle_projection_is_global_though_two_branches_are_near():
     z = vec(3.0, 0.0).reshape(1, 2)
-    moved = (nearest(saddle(), z) - z).norm()
+    moved = (project_state(saddle(), z) - z).norm()
     assert float(moved) <= float(nearest_of(_boundary(saddle()), z)) + 1e-8  # 1e-8: bisection
 
 

@@ -9,16 +9,16 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import Rate, limits
+from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.load import json_schema, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint, pull_back, stack
 from cdiff_cli.errors import CdiffError, InfeasibleError, SpecError
 from cdiff_cli.evaluation.metrics import rollout_metrics, unsafe_segments
 from cdiff_cli.planning.start_goal import fastest
 from cdiff_cli.projection.project import project
-from cdiff_cli.projection.rate import Slowed
+from cdiff_cli.projection.rate import RateProjection
 from cdiff_cli.sampling.safediffuser import jacobian
 from cdiff_cli.tasks import load_task
 from tests.commands.test_cli import cdiff
@@ -49,8 +49,8 @@ DT = 0.01  # of the mazes
 
 def rate(dim=1, of=(0,), low=None, high=1.0, norm=False, dt=1.0, name="r"):
     one = torch.ones(dim, dtype=F64)
-    low, high = limits(low, high)
-    return Rate(
+    low, high = rate_bounds(low, high)
+    return RateLimit(
         name, torch.eye(dim, dtype=F64)[list(of)], low, high, norm, dt, torch.zeros_like(one), one
     )
 
@@ -117,11 +117,11 @@ def test_the_size_bounds_the_largest_eigenvalue_that_rows_give(kind):
 
 
 def test_a_margin_narrows_the_limits_and_too_wide_a_one_is_refused():
-    part = rate(low=-1.0, high=1.0).shift(0.4)
+    part = rate(low=-1.0, high=1.0).tighten(0.4)
     assert (part.low, part.high) == (-0.6, 0.6)
     for narrow in (rate(low=-1.0, high=1.0), rate(high=1.0, norm=True)):
         with pytest.raises(InfeasibleError, match="no rate of change"):
-            narrow.shift(1.5)
+            narrow.tighten(1.5)
 
 
 # the projection -------------------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def test_each_plan_s_own_frame_is_used():
 
 def test_a_projection_begun_where_the_last_one_ended_ends_at_the_same_point():
     z, part = 0.1 * normal(0, 2, 30, 2), LIMITS["length"]
-    slowed = Slowed([part], Pins.none(z))
+    slowed = RateProjection([part], Pins.none(z))
     slowed(z + 0.01 * normal(1, 2, 30, 2))
     torch.testing.assert_close(slowed(z), free_projection(only(part), z), atol=1e-8, rtol=0)
 
@@ -282,7 +282,7 @@ def test_a_list_limits_the_length_and_a_name_the_signed_change(tmp_path):
     torch.testing.assert_close(g(x), torch.tensor([[897.0]], dtype=F64), atol=1e-9, rtol=0)
     (kind,), _ = load(tmp_path, {"kind": "rate", "of": "vx", "min": -5.0})
     assert kind.describe() == "-5 <= change of vx a second between waypoints"
-    assert "RateLimit" in json_schema()["$defs"]
+    assert "RateSpec" in json_schema()["$defs"]
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_a_control_task_is_refused(tmp_path):
         tmp_path, f"task: hopper\nconstraints:\n  - {{kind: rate, of: {layout[0]}, max: 1.0}}\n"
     )
     with pytest.raises(CdiffError, match="`kind: rate` is for whole plans"):
-        resolve(Options(task="hopper", constraints=path))
+        resolve(Request(task="hopper", constraints=path))
 
 
 # certificates, metrics ------------------------------------------------------------------------------------------------

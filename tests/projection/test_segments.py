@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, stack
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.project import REFINEMENTS, project
 from cdiff_cli.projection.segments import NEVER, nearest_in_planes, normals, planes
@@ -29,7 +29,7 @@ seeds = st.integers(0, 10_000)
 
 
 def segments(level, name="s"):
-    return Constraint((Segments(name, level),))
+    return Constraint((OnSegments(name, level),))
 
 
 def outside(k, radius, dim=None):
@@ -132,8 +132,8 @@ def test_coordinates_that_the_ball_does_not_name_stay():
 
 
 def test_a_half_space_is_a_plane_of_every_waypoint_unchanged():
-    wall, z = Affine(vec(1.0, 2.0), num(0.7)), normal(0, 2, 3, 2)
-    a, b = planes((Waypoints("w", wall),), z, Pins.none(z))
+    wall, z = HalfSpace(vec(1.0, 2.0), num(0.7)), normal(0, 2, 3, 2)
+    a, b = planes((AtWaypoints("w", wall),), z, Pins.none(z))
     assert torch.equal(a, wall.a.expand(2, 3, 1, 2))
     assert torch.equal(b, wall.b.expand(2, 3, 1))
 
@@ -163,7 +163,9 @@ def test_two_pinned_ends_on_opposite_sides_of_a_disc_leave_a_lone_segment_no_way
     z = one((-2.0, 0.0), (2.0, 0.0))
     with pytest.raises(InfeasibleError):
         project(
-            Constraint((Segments("disc", UNIT), Waypoints("far", Affine(vec(0.0, 1.0), num(9.0))))),
+            Constraint(
+                (OnSegments("disc", UNIT), AtWaypoints("far", HalfSpace(vec(0.0, 1.0), num(9.0))))
+            ),
             z,
             pin(z, 0, 1),
         )
@@ -185,7 +187,7 @@ def test_two_discs_are_both_avoided():
 
 def test_a_disc_and_a_wall_are_obeyed_at_once():
     """The wall y <= 1.2 leaves a gap of 0.2 above the disc, which the path has to thread."""
-    g = stack([segments(UNIT), waypoints(Affine(vec(0.0, 1.0), num(1.2)), "wall")])
+    g = stack([segments(UNIT), waypoints(HalfSpace(vec(0.0, 1.0), num(1.2)), "wall")])
     s = torch.linspace(-2, 2, 41, dtype=F64)
     z = torch.stack((s, 0.3 + 0 * s), -1)[None]
     x = free(g, z)
@@ -200,7 +202,7 @@ BESIDE = {
     ),
     "a chain over a wall": (
         segments(ball(1, centre=(0.0, 0.0), radius=0.5)),
-        chain(Affine(vec(0.0, 1.0), num(0.8)), 0.3),
+        chain(HalfSpace(vec(0.0, 1.0), num(0.8)), 0.3),
     ),
     "a chain over the same disc": (
         Constraint(chain(ball(1, centre=(0.0, 0.0), radius=0.5), 0.3).parts[0].on_segments()),
@@ -377,7 +379,7 @@ def test_pinned_waypoints_do_not_heed_the_planes():
 
 def slsqp(level, z, restarts=8):
     """The least distance of a segment-safe path from z [horizon, k] that SLSQP finds from random beginnings."""
-    part, target, rng, best = Segments("s", level), z.numpy(), np.random.default_rng(0), math.inf
+    part, target, rng, best = OnSegments("s", level), z.numpy(), np.random.default_rng(0), math.inf
     shape, each = (1, *z.shape), torch.eye(len(z) - 1, dtype=F64)
 
     def room(v):

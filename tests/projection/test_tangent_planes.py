@@ -7,9 +7,14 @@ from hypothesis import strategies as st
 
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint, stack
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import REFINEMENTS
-from cdiff_cli.projection.segments import nearest_around, nearest_in_planes, planes, turned
+from cdiff_cli.projection.segments import (
+    nearest_around,
+    nearest_in_planes,
+    planes,
+    with_tangent_planes,
+)
 from tests.problems import F64, ball, half_space, normal, pin, waypoints
 from tests.projection.test_segments import outside, pushed_out, quick, random_path, seeds, segments
 
@@ -20,7 +25,7 @@ def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(see
     """A half-space that keeps both ends on its side keeps the segment; in metres, as f of a ball is."""
     z = normal(seed, 3, horizon, 2)
     g = segments(outside(2, radius))
-    flat = turned(g, z, Pins.none(z))
+    flat = with_tangent_planes(g, z, Pins.none(z))
     x = z + 0.3 * normal(seed + 1, 3, horizon, 2)
     rows, _, size = flat.linearise(x)
     assert rows.shape == (3, 2 * horizon)
@@ -37,16 +42,18 @@ def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(see
 
 
 def test_turned_leaves_other_parts_as_they_are():
-    wall, inside = Waypoints("w", half_space()), Waypoints("i", ball(-1))
+    wall, inside = AtWaypoints("w", half_space()), AtWaypoints("i", ball(-1))
     others, z = Constraint((wall, inside)), normal(3, 2, 5, 2)
-    flat = turned(Constraint((wall, *segments(ball(1)).parts, inside)), z, Pins.none(z))
+    flat = with_tangent_planes(
+        Constraint((wall, *segments(ball(1)).parts, inside)), z, Pins.none(z)
+    )
     assert flat.rest == others
     rows, _, size = flat.linearise(z)
     assert torch.equal(rows[:, :10], others(z))
     torch.testing.assert_close(
         size[:, :10], 2 * others.linearise(z)[2]
     )  # four kinds of rows at each waypoint instead of two
-    assert turned(others, z, Pins.none(z)) is others
+    assert with_tangent_planes(others, z, Pins.none(z)) is others
 
 
 @quick
@@ -54,7 +61,7 @@ def test_turned_leaves_other_parts_as_they_are():
 def test_the_pull_of_turned_rows_is_their_gradient(seed, horizon):
     """The rows are affine, so a difference is a derivative, to rounding."""
     z = normal(seed, 2, horizon, 2)
-    flat = turned(stack([waypoints(half_space()), segments(ball(1))]), z, Pins.none(z))
+    flat = with_tangent_planes(stack([waypoints(half_space()), segments(ball(1))]), z, Pins.none(z))
     x, d, w = (normal(seed + k, 2, horizon, 2) for k in (1, 2, 3))
     rows, pull, _ = flat.linearise(x)
     w = normal(seed + 3, *rows.shape)

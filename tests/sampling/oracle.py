@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.normaliser import Normaliser
@@ -135,8 +135,8 @@ def three_routes(horizon: int = 32) -> Routes:
 # constraints, in metres ---------------------------------------------------------------------------------------------------
 
 
-def _half_space(x: float, y: float, b: float) -> Affine:
-    return Affine(torch.tensor([x, y], dtype=F64), torch.tensor(b, dtype=F64))
+def _half_space(x: float, y: float, b: float) -> HalfSpace:
+    return HalfSpace(torch.tensor([x, y], dtype=F64), torch.tensor(b, dtype=F64))
 
 
 def _outside(x: float, y: float, radius: float) -> Ellipsoid:
@@ -147,21 +147,21 @@ def _outside(x: float, y: float, radius: float) -> Ellipsoid:
 
 
 CONSTRAINTS = {
-    "corner": Constraint((Waypoints("corner", _half_space(0.5, 0.866, 0.75)),)),
-    "disc": Constraint((Waypoints("disc", _outside(0.0, 0.9, 0.2)),)),
-    "wide disc": Constraint((Waypoints("wide disc", _outside(0.0, 0.45, 0.4)),)),
+    "corner": Constraint((AtWaypoints("corner", _half_space(0.5, 0.866, 0.75)),)),
+    "disc": Constraint((AtWaypoints("disc", _outside(0.0, 0.9, 0.2)),)),
+    "wide disc": Constraint((AtWaypoints("wide disc", _outside(0.0, 0.45, 0.4)),)),
     "slab": Constraint(
         (
-            Waypoints("above", _half_space(0.0, 1.0, 0.8)),
-            Waypoints("below", _half_space(0.0, -1.0, 0.8)),
+            AtWaypoints("above", _half_space(0.0, 1.0, 0.8)),
+            AtWaypoints("below", _half_space(0.0, -1.0, 0.8)),
         )
     ),
     "discs": Constraint(
         tuple(
-            Waypoints(f"disc {k}", _outside(0.0, y, 0.25)) for k, y in enumerate((0.9, -0.9, 0.0))
+            AtWaypoints(f"disc {k}", _outside(0.0, y, 0.25)) for k, y in enumerate((0.9, -0.9, 0.0))
         )
     ),
-    "chain": Constraint((Chain("chain", _half_space(0.0, 1.0, 1.0), 0.12),)),
+    "chain": Constraint((DiscreteBarrier("chain", _half_space(0.0, 1.0, 1.0), 0.12),)),
 }
 
 

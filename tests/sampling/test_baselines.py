@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.comparison import METHOD_ORDER
 from cdiff_cli.models.schedule import Schedule
@@ -63,7 +63,7 @@ def test_guidance_leaves_pins_alone():
 
 def test_terminal_is_the_projection_with_latent_correction():
     """By hand: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0)."""
-    terminal, g = make_method("terminal", {}), waypoints(Affine(vec(1.0, 1.0), num(0.8)))
+    terminal, g = make_method("terminal", {}), waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
     assert terminal == Projected(on="clean", correction="latent")
     assert torch.equal(plans(terminal, g), plans(Projected(correction="latent"), g))
     x = normal(0, 3, 4, 2)
@@ -77,15 +77,15 @@ def test_terminal_has_no_settings_and_records_none(setting):
         CdiffError,
         match=f'terminal has no setting "{setting.split("=")[0]}"; its settings are: none',
     ):
-        resolve(Options(task="gaussian2d", method="terminal", settings=(setting,)))
-    resolved = resolve(Options(task="gaussian2d", method="terminal"))
+        resolve(Request(task="gaussian2d", method="terminal", settings=(setting,)))
+    resolved = resolve(Request(task="gaussian2d", method="terminal"))
     assert resolved.method == Projected(on="clean", correction="latent")
     assert resolved.config()["method"] == {"terminal": {}}
     assert resolved.row()["method"] == "terminal"
 
 
 def test_the_final_projection_is_the_unconstrained_plan_projected():
-    g = waypoints(Affine(vec(1.0, 1.0), num(0.8)))
+    g = waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
     free = plans(Unconstrained(), g)
     assert float(g(free).max()) > 0.1
     torch.testing.assert_close(
@@ -95,7 +95,7 @@ def test_the_final_projection_is_the_unconstrained_plan_projected():
 
 @pytest.fixture(scope="module")
 def gaussian():
-    return resolve(Options(task="gaussian2d", method="best-of-k", n=6, steps=20))
+    return resolve(Request(task="gaussian2d", method="best-of-k", n=6, steps=20))
 
 
 def test_best_of_one_is_the_unconstrained_plan(gaussian):

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.segments import OnSegments
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.sampling.methods import (
@@ -69,7 +69,7 @@ def test_alm_multiplier_of_unit_mean_shift_is_one():
 
 
 def test_multiplier_of_a_slack_mean_constraint_is_zero():
-    g = waypoints(Affine(vec(1.0), num(1.0)))  # E x <= 1 already holds for N(0, 1)
+    g = waypoints(HalfSpace(vec(1.0), num(1.0)))  # E x <= 1 already holds for N(0, 1)
     _, states = langevin_chain(
         PrimalDual(on="noisy", eta=0.05, expectation="batch_mean"),
         g,
@@ -211,7 +211,7 @@ def test_projected_plans_satisfy_g(kind, on):
 )
 def test_clean_methods_end_on_the_half_space(method, extra_steps, most):
     g = waypoints(
-        Affine(vec(1.0, 1.0), num(0.8))
+        HalfSpace(vec(1.0, 1.0), num(0.8))
     )  # the plans' x + y ~ N(1, 0.14^2): nearly all of them violate
     assert float(g(_plan(Unconstrained(), g)).max()) > 0.2
     assert float(g(_plan(method, g, extra_steps=extra_steps)).max()) <= most
@@ -221,7 +221,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
     """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
     s = torch.linspace(-2, 2, horizon, dtype=F64)
     line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
-    g = Constraint((Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    g = Constraint((OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
     noise = draws(11, 1, horizon, 2)
     return sample(
         gaussian_denoiser(SCHEDULE, line, 1e-3),
@@ -253,7 +253,10 @@ def test_clean_methods_go_round_a_disc_without_tearing(method):
 def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expectation):
     x = torch.linspace(-1, 1, 12, dtype=F64)[None, :, None] + 0.1 * normal(8, 3, 12, 2)
     g = Constraint(
-        (Waypoints("wall", half_space()), Segments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)))
+        (
+            AtWaypoints("wall", half_space()),
+            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),
+        )
     )
     method, pins = kind(on=on, expectation=expectation), pin(x, 0, -1)
     state, sizes = method.init(x, g), set()
@@ -318,7 +321,9 @@ def test_silu_replaces_g_by_its_smooth_positive_part_and_its_slope():
 
 @pytest.mark.parametrize("name", ["primal-dual", "alm"])
 def test_silu_keeps_multipliers_finite_through_a_whole_plan(name):
-    out = _plan(make_method(name, {"positive": "silu"}), waypoints(Affine(vec(1.0, 1.0), num(0.8))))
+    out = _plan(
+        make_method(name, {"positive": "silu"}), waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
+    )
     assert bool(out.isfinite().all())
 
 
@@ -368,7 +373,7 @@ def test_latent_correction_moves_the_sample_by_the_whole_projection():
     """x_{t-1} = reverse(x0) + level (P(x0) - x0), by hand: x0 = 2 projected onto x <= 1, reverse halves, level 0.8."""
     x = torch.full((1, 1, 1), 2.0)
     step = Step(x, x, 0.1, 0.8, lambda clean: clean / 2, Pins.none(x), False)
-    g = waypoints(Affine(torch.ones(1), torch.ones(())))
+    g = waypoints(HalfSpace(torch.ones(1), torch.ones(())))
     kernel, _ = Projected().step(step, g, None)
     latent, _ = Projected(correction="latent").step(step, g, None)
     assert float(kernel) == pytest.approx(0.5)

@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.black_box import Opaque
+from cdiff_cli.constraints.black_box import BlackBox
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.sampling.methods import Unconstrained, make_method
@@ -50,7 +50,7 @@ def test_ros_moves_a_half_space_violation_by_its_closed_form():
     """a.u <= k (b - margin - a.x): x + u0 - a [a.u0 - k (b - margin - a.x)]_+ / |a|^2."""
     x, asked = normal(0, 5, 4, 2), normal(1, 5, 4, 2)
     a, b = vec(1.0, -2.0), 0.3
-    out = moved(SafeDiffuser(gain=0.5, margin=0.1), waypoints(Affine(a, num(b))), x, asked)
+    out = moved(SafeDiffuser(gain=0.5, margin=0.1), waypoints(HalfSpace(a, num(b))), x, asked)
     over = ((asked - x) @ a - 0.5 * (b - 0.1 - x @ a)).clamp_min(0)
     assert float(over.max()) > 0.5
     torch.testing.assert_close(
@@ -114,7 +114,10 @@ def test_closed_form_is_what_proxqp_finds(kind, variant):
 
 def test_rows_of_several_barriers_at_one_waypoint_are_solved_together():
     g = Constraint(
-        tuple(Waypoints(str(i), Affine(vec(math.cos(i), math.sin(i)), num(0.1))) for i in range(6))
+        tuple(
+            AtWaypoints(str(i), HalfSpace(vec(math.cos(i), math.sin(i)), num(0.1)))
+            for i in range(6)
+        )
     )
     x, asked = 0.1 * normal(6, 30, 4, 2), normal(7, 30, 4, 2, scale=2.0)
     both = [moved(SafeDiffuser(solver=solver), g, x, asked) for solver in ("closed-form", "proxqp")]
@@ -184,8 +187,8 @@ def test_steps_that_are_safe_already_stay_as_sampled_to_the_last_bit():
 def test_barriers_that_contradict_each_other_are_said_aloud(solver):
     g = Constraint(
         (
-            Waypoints("up", Affine(vec(-1.0, 0.0), num(-1.0))),
-            Waypoints("down", Affine(vec(1.0, 0.0), num(-1.0))),
+            AtWaypoints("up", HalfSpace(vec(-1.0, 0.0), num(-1.0))),
+            AtWaypoints("down", HalfSpace(vec(1.0, 0.0), num(-1.0))),
         )
     )
     x = torch.zeros(1, 2, 2, dtype=F64)
@@ -196,7 +199,7 @@ def test_barriers_that_contradict_each_other_are_said_aloud(solver):
 @pytest.mark.parametrize("variant", ["ros", "res"])
 def test_whole_plans_end_safe(variant):
     schedule = Schedule.cosine(20)
-    g, like = waypoints(Affine(vec(1.0, 1.0), num(0.8))), torch.zeros(8, 4, 2, dtype=F64)
+    g, like = waypoints(HalfSpace(vec(1.0, 1.0), num(0.8))), torch.zeros(8, 4, 2, dtype=F64)
     plans = [
         sample(
             gaussian_denoiser(schedule, 0.5, 0.1),
@@ -230,7 +233,7 @@ def test_a_bad_setting_is_one_clear_line(values, message):
 
 
 def test_opaque_rows_count_as_coupled():
-    g = Constraint((Opaque("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
+    g = Constraint((BlackBox("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
     x = torch.zeros(1, 3, 2, dtype=F64)
     out = moved(SafeDiffuser(), g, x, x + 1.0)  # sum 6: the nearest with sum 0.99
     torch.testing.assert_close(out, torch.full_like(x, 0.99 / 6), atol=1e-9, rtol=0)

@@ -91,7 +91,7 @@ def numbered(*lengths: int) -> list[np.ndarray]:
 
 
 def test_every_stretch_of_an_episode_is_a_window():
-    windows = Windows.of(numbered(4, 2, 3), 3)
+    windows = Windows.from_episodes(numbered(4, 2, 3), 3)
     every = windows[torch.arange(len(windows.starts))]
     assert every[:, 0].tolist() == [[0, 0], [0, 1], [2, 0]]
     assert every[:, :, 1].tolist() == [[0, 1, 2], [1, 2, 3], [0, 1, 2]]
@@ -106,9 +106,9 @@ def test_every_stretch_of_an_episode_is_a_window():
 def test_no_window_crosses_the_border_of_an_episode(lengths, horizon, seed):
     if max(lengths) < horizon:
         with pytest.raises(CdiffError, match=f"a window needs {horizon}"):
-            Windows.of(numbered(*lengths), horizon)
+            Windows.from_episodes(numbered(*lengths), horizon)
         return
-    windows = Windows.of(numbered(*lengths), horizon)
+    windows = Windows.from_episodes(numbered(*lengths), horizon)
     assert len(windows.starts) == sum(max(n - horizon + 1, 0) for n in lengths)
     drawn = windows.draw(16, torch.Generator().manual_seed(seed))
     assert drawn.shape == (16, horizon, 2)
@@ -118,11 +118,11 @@ def test_no_window_crosses_the_border_of_an_episode(lengths, horizon, seed):
 
 def test_windows_of_no_episodes_say_so():
     with pytest.raises(CdiffError, match="longest of 0 episodes has 0 states"):
-        Windows.of([], 3)
+        Windows.from_episodes([], 3)
 
 
 def test_draws_repeat_with_their_generator():
-    windows = Windows.of(numbered(50), 3)
+    windows = Windows.from_episodes(numbered(50), 3)
     first, again = (windows.draw(5, torch.Generator().manual_seed(1)) for _ in range(2))
     assert torch.equal(first, again)
 
@@ -138,7 +138,7 @@ def probabilities(windows: Windows) -> torch.Tensor:
 
 
 def test_favoured_trips_get_their_share_in_proportion_to_their_length():
-    uniform = Windows.of([trip()], 14)
+    uniform = Windows.from_episodes([trip()], 14)
     windows = uniform.favour_trips(0.5, [0], [1])
     ends = windows[torch.arange(len(windows.starts))]
     rest = (ends[:, 0, 1] == 0) & (ends[:, -1, 1] == 0)
@@ -153,7 +153,7 @@ def test_favoured_trips_get_their_share_in_proportion_to_their_length():
 
 
 def test_drawn_windows_show_the_favour():
-    uniform = Windows.of([trip()], 14)
+    uniform = Windows.from_episodes([trip()], 14)
     shares = []
     for windows in (uniform, uniform.favour_trips(0.9, [0], [1])):
         drawn = windows.draw(2000, torch.Generator().manual_seed(0))
@@ -166,7 +166,7 @@ def test_drawn_windows_show_the_favour():
     ("episode", "share"), [(trip(), 0.0), (trip()[5:15], 0.5), (trip()[:5], 0.5)]
 )
 def test_without_a_share_or_without_trips_draws_stay_uniform(episode, share):
-    windows = Windows.of([episode], 4)
+    windows = Windows.from_episodes([episode], 4)
     assert torch.equal(windows.favour_trips(share, [0], [1]).cumulative, windows.cumulative)
 
 

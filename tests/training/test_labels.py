@@ -6,17 +6,17 @@ import pytest
 import torch
 
 from cdiff_cli.commands.plan import _plan_both
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.evaluation.metrics import violation
 from cdiff_cli.models.denoiser import guided
 from cdiff_cli.models.networks import ResidualMlp, TemporalUnet
 from cdiff_cli.paths import home
-from cdiff_cli.training.labels import Condition, drop
+from cdiff_cli.training.labels import ConstraintLabel, drop
 from tests.problems import generator, normal, num, vec
 from tests.training.test_fit import TINY, fit, own_minari, same  # noqa: F401  own_minari keeps the user's datasets untouched
 
@@ -28,8 +28,8 @@ SIZES = {
 
 def condition(b=0.5):
     """x <= b."""
-    return Condition(
-        "x", Constraint((Waypoints("x", Affine(vec(1.0, 0.0, 0.0, 0.0), num(b))),)), "abc"
+    return ConstraintLabel(
+        "x", Constraint((AtWaypoints("x", HalfSpace(vec(1.0, 0.0, 0.0, 0.0), num(b))),)), "abc"
     )
 
 
@@ -177,7 +177,7 @@ def test_a_base_of_another_network_or_other_data_is_refused(tmp_path):
 
 def test_the_shipped_planner_violates_less_than_the_unconditional_one_and_counts_both_calls():
     """Seeds 0-9, 64 steps: 0.004 of the violation was left; here four plans of 16 steps each."""
-    resolved = resolve(Options(method="conditional", preset="paper", n=4, steps=16))
+    resolved = resolve(Request(method="conditional", preset="paper", n=4, steps=16))
     plans, free = _plan_both(resolved, lambda *_: None)
     left, before = (violation(resolved.problem.g, each.x).sum() for each in (plans, free))
     assert left < 0.6 * before
@@ -189,6 +189,6 @@ def test_constraints_edited_since_training_are_refused(tmp_path):
     text = (home() / "constraints" / "maze2d-umaze.yaml").read_text()
     file.write_text(text.replace("b: 1.82", "b: 1.83"))
     with pytest.raises(CheckpointError, match="trained for other constraints than"):
-        resolve(Options(method="conditional", constraints=file))
+        resolve(Request(method="conditional", constraints=file))
     file.write_text("# a comment\n" + text)
-    assert resolve(Options(method="conditional", constraints=file)).guided is not None
+    assert resolve(Request(method="conditional", constraints=file)).guided is not None

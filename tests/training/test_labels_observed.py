@@ -12,20 +12,20 @@ from gymnasium.utils import seeding
 from typer.testing import CliRunner
 
 from cdiff_cli.cli import app
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.commands.run_directory import read_rows
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.checkpoint import load_checkpoint
-from cdiff_cli.models.denoiser import Telling, guided
+from cdiff_cli.models.denoiser import ObservationEncoder, guided
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.planning.receding_horizon import control
 from cdiff_cli.tasks.ball_run.env import DT, BallRunEnv
 from cdiff_cli.tasks.ball_run.obstacles import PATTERNS, beside
 from cdiff_cli.tasks.ball_run.task import BALL_RUN
 from cdiff_cli.training.demonstrations import demonstrations
-from cdiff_cli.training.labels import Condition
-from cdiff_cli.training.windows import Beside, Data
+from cdiff_cli.training.labels import ConstraintLabel
+from cdiff_cli.training.windows import SampledObservations, TrainingSet
 from tests.problems import generator
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +34,7 @@ FILE = ROOT / "constraints" / "ball-run.yaml"
 
 @pytest.fixture(scope="module")
 def condition():
-    return Condition.read(FILE, BALL_RUN)
+    return ConstraintLabel.read(FILE, BALL_RUN)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -125,7 +125,9 @@ def test_the_obstacle_of_a_label_goes_on_as_it_is_seen_to(condition):
 
 def test_quantities_are_told_relative_to_the_coordinate_they_are_called_after():
     names, layout = ("obstacle.x", "obstacle.vy", "wind"), ("x", "y", "vx", "vy")
-    telling = Telling(torch.tensor([0, 3, -1]), torch.zeros(3), torch.tensor([2.0, 1.0, 1.0]))
+    telling = ObservationEncoder(
+        torch.tensor([0, 3, -1]), torch.zeros(3), torch.tensor([2.0, 1.0, 1.0])
+    )
     told = telling(
         [torch.tensor([5.0]), torch.tensor([1.0]), torch.tensor([7.0])],
         torch.tensor([[1.0, 0.0, 0.0, 0.25]]),
@@ -135,7 +137,7 @@ def test_quantities_are_told_relative_to_the_coordinate_they_are_called_after():
         torch.randn(3, 500, generator=generator(0)).double(),
         torch.randn(500, 4, generator=generator(1)).double(),
     )
-    fitted = Telling.fit(names, layout, list(values), states)
+    fitted = ObservationEncoder.fit(names, layout, list(values), states)
     assert fitted.columns.tolist() == [0, 3, -1]
     told = fitted(list(values), states)
     torch.testing.assert_close(told.mean(0), torch.zeros(3), atol=1e-5, rtol=0)  # float32
@@ -146,7 +148,9 @@ def test_quantities_are_told_relative_to_the_coordinate_they_are_called_after():
 def drawn(condition):
     """4000 windows of a few demonstrations, and what a network is told of them."""
     episodes, recipe = demonstrations(BALL_RUN, 2000, 0), load_recipe("ball-run")
-    data = Data.of(BALL_RUN, recipe, recipe.train["conditional"], episodes, condition, 0)
+    data = TrainingSet.from_episodes(
+        BALL_RUN, recipe, recipe.train["conditional"], episodes, condition, 0
+    )
     return data.draw(4000, generator(0))[1]
 
 
@@ -169,7 +173,7 @@ def test_a_task_that_cannot_draw_what_is_observed_is_refused_in_one_line(conditi
         CdiffError,
         match=r"^drone: the constraints observe obstacle\.x, .*, which demonstrations do not hold.*$",
     ):
-        Beside.of(task, [np.zeros((20, 4))], condition.observed, 0)
+        SampledObservations.from_task(task, [np.zeros((20, 4))], condition.observed, 0)
 
 
 class _Told(torch.nn.Module):
@@ -252,7 +256,7 @@ def test_a_planner_is_trained_and_acts_as_typed(place, tmp_path):
 @pytest.mark.usefixtures("place")
 def test_each_plan_is_told_what_is_observed_when_it_is_made():
     acting, told = (
-        controller(resolve(Options(task="ball-run", method="conditional", preset="paper", n=2))),
+        controller(resolve(Request(task="ball-run", method="conditional", preset="paper", n=2))),
         [],
     )
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
-from cdiff_cli.constraints.state_sets import Affine
+from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.models.checkpoint import install
 from cdiff_cli.models.denoiser import calls_a_step, guided
@@ -18,9 +18,9 @@ from cdiff_cli.models.recipe import DemonstrationSpec, MlpSpec, Recipe, ReturnSp
 from cdiff_cli.tasks.ball_run.task import BALL_RUN
 from cdiff_cli.training.demonstrations import demonstrations, load_rewards
 from cdiff_cli.training.fit import train
-from cdiff_cli.training.labels import Condition
-from cdiff_cli.training.return_labels import Returns, mean_rewards
-from cdiff_cli.training.windows import Data
+from cdiff_cli.training.labels import ConstraintLabel
+from cdiff_cli.training.return_labels import ReturnLabel, mean_rewards
+from cdiff_cli.training.windows import TrainingSet
 from tests.problems import generator, num, vec
 from tests.training.test_fit import same
 from tests.training.test_fit_control import TINY
@@ -72,7 +72,9 @@ def test_a_file_with_a_reward_for_its_last_state_too_counts_it():
 
 def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknown():
     episodes = [walk(5, 10.0 * k) for k in range(101)]
-    returns = Returns.of(episodes, [np.full(5, k / 100) for k in range(101)], DISCOUNT)
+    returns = ReturnLabel.from_episodes(
+        episodes, [np.full(5, k / 100) for k in range(101)], DISCOUNT
+    )
     assert (returns.low, returns.high) == (pytest.approx(0.02), pytest.approx(0.98))
     label = returns.label.reshape(101, 6, 2)
     assert label[0, 0].tolist() == [-1.0, 2.0]
@@ -105,7 +107,7 @@ def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknow
 )
 def test_rewards_that_tell_nothing_apart_are_refused(rewards, said):
     with pytest.raises(CdiffError, match=said):
-        Returns.of([walk(len(rewards))], [rewards], DISCOUNT)
+        ReturnLabel.from_episodes([walk(len(rewards))], [rewards], DISCOUNT)
 
 
 # rewards --------------------------------------------------------------------------------------------------------------
@@ -242,7 +244,9 @@ def test_windows_are_drawn_with_the_label_of_their_first_state_and_a_share_witho
     episodes = demonstrations(BALL_RUN, 1000, 0)
     count = sum(map(len, episodes))
     labels = torch.stack((torch.arange(count) + 1.0, -torch.arange(count) - 1.0), 1)
-    data = Data.of(BALL_RUN, RECIPE, TOLD, episodes, None, 0, Returns(labels, 0.0, 1.0))
+    data = TrainingSet.from_episodes(
+        BALL_RUN, RECIPE, TOLD, episodes, None, 0, ReturnLabel(labels, 0.0, 1.0)
+    )
     _, label = data.draw(4000, generator(0))
     index = data.windows.pick(4000, generator(0))  # the same numbers, drawn first
     shown = label[:, 0] != 0
@@ -259,8 +263,8 @@ def test_a_conditional_planner_begins_from_it_without_what_its_labels_mean(
     monkeypatch.setattr("cdiff_cli.training.fit.home", lambda: tmp_path)
     monkeypatch.setattr("cdiff_cli.models.checkpoint.home", lambda: tmp_path)
     install(whole)
-    side = Condition(
-        "side", Constraint((Waypoints("y", Affine(vec(0.0, 1.0, 0.0, 0.0), num(0.5))),)), "abc"
+    side = ConstraintLabel(
+        "side", Constraint((AtWaypoints("y", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.5))),)), "abc"
     )
     made = fit(tmp_path / "work", "conditional", condition=side)
     assert (made.card.recipe, made.card.returns) == ("conditional-side", None)
@@ -305,8 +309,8 @@ def test_a_base_of_other_demonstrations_is_refused_with_its_recipe(whole, tmp_pa
     ],
 )
 def test_a_recipe_that_does_not_fit_its_returns_is_one_clear_line(change, asked, said, tmp_path):
-    side = Condition(
-        "side", Constraint((Waypoints("y", Affine(vec(0.0, 1.0, 0.0, 0.0), num(0.5))),)), "abc"
+    side = ConstraintLabel(
+        "side", Constraint((AtWaypoints("y", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.5))),)), "abc"
     )
     recipe = RECIPE.model_copy(update={"train": {"tiny": TOLD.model_copy(update=change)}})
     with pytest.raises(CdiffError, match=f'recipe "tiny" of ball-run: {said}'):
@@ -353,7 +357,7 @@ def test_the_weight_of_the_recipe_counts_its_network_calls(weight, calls, whole,
     asking(weight)
     for method, tries in (("diffuser", 1), ("alm", 1), ("best-of-k", 8)):
         found = resolve(
-            Options(task="ball-run", method=method, checkpoint=whole.path, device="cpu")
+            Request(task="ball-run", method=method, checkpoint=whole.path, device="cpu")
         )
         assert found.conditions.returns == weight
         assert found.config()["returns"] == weight
@@ -371,7 +375,7 @@ def test_plans_are_asked_for_the_most_by_every_method_and_preset(whole, asking):
         ("alm", "recommended"),
     ):
         found = resolve(
-            Options(
+            Request(
                 task="ball-run", method=method, preset=preset, checkpoint=whole.path, device="cpu"
             )
         )
@@ -380,7 +384,7 @@ def test_plans_are_asked_for_the_most_by_every_method_and_preset(whole, asking):
 
 def test_a_checkpoint_that_knows_no_returns_is_asked_for_none(asking):
     asking(2.0)
-    found = resolve(Options(task="ball-run", device="cpu"))
+    found = resolve(Request(task="ball-run", device="cpu"))
     assert found.conditions.returns == 0.0
     assert controller(found).calls == 20
 
@@ -388,6 +392,6 @@ def test_a_checkpoint_that_knows_no_returns_is_asked_for_none(asking):
 def test_conditional_asks_for_what_obeys_and_not_for_returns(asking, whole):
     asking(2.0)
     found = resolve(
-        Options(task="ball-run", method="conditional", checkpoint=whole.path, device="cpu")
+        Request(task="ball-run", method="conditional", checkpoint=whole.path, device="cpu")
     )
     assert found.conditions.returns == 0.0

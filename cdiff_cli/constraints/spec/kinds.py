@@ -6,10 +6,10 @@ from typing import Annotated, Literal, cast
 import torch
 from pydantic import Field, model_validator
 
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.dynamics import LinearDynamics, Reachable
-from cdiff_cli.constraints.hocbf import approached
-from cdiff_cli.constraints.rate import Rate, limits
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
+from cdiff_cli.constraints.hocbf import second_order
+from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.sets import (
     Coordinates,
     Hold,
@@ -27,8 +27,8 @@ from cdiff_cli.constraints.spec.sets import (
     observed_or_not,
     vector,
 )
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Level
-from cdiff_cli.constraints.trajectory import Part
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, StateSet
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.yaml_files import Strict
 
 DYNAMICS_TOLERANCE = (
@@ -138,23 +138,23 @@ class Dcbf(Strict):
         yield from ((("barrier", *location), name) for location, name in self.barrier.observes())
         yield from names_in({"velocity": self.velocity})
 
-    def compile(self, layout: Layout) -> Part:
+    def compile(self, layout: Layout) -> TrajectoryConstraint:
         return observed_or_not(
             self.name, self.barrier, self.velocity, self.hold, layout, self._chain
         )
 
-    def _chain(self, at: Callable[[float], Level], layout: Layout) -> Part:
+    def _chain(self, at: Callable[[float], StateSet], layout: Layout) -> TrajectoryConstraint:
         alpha2 = None if self.order == 1 else self.alpha2 or self.alpha
         if self.look_ahead is None:
-            return Chain(self.name, at(0.0), self.alpha, alpha2)
+            return DiscreteBarrier(self.name, at(0.0), self.alpha, alpha2)
         led = torch.eye(len(layout), dtype=torch.float64)
         for name, rate in self.look_ahead.velocity.items():
             led[layout.index(name), layout.index(rate)] = self.look_ahead.time
-        level, later = at(0.0), cast(Affine | Ellipsoid, at(self.look_ahead.time))
-        if isinstance(later, Affine) or self.look_ahead.form == "place":
-            return Chain(self.name, level, self.alpha, alpha2, later.through(led))
-        ahead = approached(cast(Ellipsoid, level), later.centre, led, self.look_ahead.time)
-        return Chain(self.name, level, self.alpha, alpha2, ahead)
+        level, later = at(0.0), cast(HalfSpace | Ellipsoid, at(self.look_ahead.time))
+        if isinstance(later, HalfSpace) or self.look_ahead.form == "place":
+            return DiscreteBarrier(self.name, level, self.alpha, alpha2, later.compose(led))
+        ahead = second_order(cast(Ellipsoid, level), later.centre, led, self.look_ahead.time)
+        return DiscreteBarrier(self.name, level, self.alpha, alpha2, ahead)
 
     def describe(self) -> str:
         rule = f"h' >= {1 - self.alpha:g} h"
@@ -220,7 +220,7 @@ class Dynamics(Strict):
         return self
 
     @classmethod
-    def of(
+    def from_dynamics(
         cls,
         dynamics: LinearDynamics,
         layout: Layout,
@@ -258,7 +258,7 @@ class Dynamics(Strict):
         for row, columns in (self.A or {}).items():
             yield from ((("A", row, name), name) for name in columns)
 
-    def compile(self, layout: Layout) -> Part:
+    def compile(self, layout: Layout) -> TrajectoryConstraint:
         assert self.A is not None
         assert self.B is not None
         assert self.inputs is not None
@@ -270,7 +270,7 @@ class Dynamics(Strict):
             low=low,
             high=high,
         )
-        return Reachable.of(self.name, dynamics, self.tolerance)
+        return LinearDynamicsConstraint.from_dynamics(self.name, dynamics, self.tolerance)
 
     def describe(self) -> str:
         if self.fit:
@@ -281,7 +281,7 @@ class Dynamics(Strict):
         return f"each step obeys x' = A x + B u + c, {bounds}"
 
 
-class RateLimit(Strict):
+class RateSpec(Strict):
     """How fast coordinates may change from a waypoint to the next, in their units a second; the same all along the segment.
 
     of: [x, y]   a list: the length of their change together, a second, is at most `max`
@@ -304,7 +304,7 @@ class RateLimit(Strict):
     ] = None
 
     @model_validator(mode="after")
-    def _bounded(self) -> "RateLimit":
+    def _bounded(self) -> "RateSpec":
         if isinstance(self.of, str):
             if self.min is None and self.max is None:
                 raise ValueError(
@@ -326,13 +326,13 @@ class RateLimit(Strict):
         else:
             yield from ((("of", i), name) for i, name in enumerate(self.of))
 
-    def compile(self, layout: Layout) -> Part:
+    def compile(self, layout: Layout) -> TrajectoryConstraint:
         assert self.dt is not None, "the task's, see load_constraints"
         names = [self.of] if isinstance(self.of, str) else self.of
         which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
         one = torch.ones(len(layout), dtype=torch.float64)
-        low, high = limits(self.min, self.max)
-        return Rate(
+        low, high = rate_bounds(self.min, self.max)
+        return RateLimit(
             self.name,
             which,
             low,

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Protocol, Union, cast
 from pydantic import Field, create_model
 
 from cdiff_cli.constraints.dynamics import LinearDynamics
-from cdiff_cli.constraints.spec.kinds import Dcbf, Dynamics, RateLimit
+from cdiff_cli.constraints.spec.kinds import Dcbf, Dynamics, RateSpec
 from cdiff_cli.constraints.spec.sets import Layout, Linear, Location, Quadratic
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.errors import suggestion
 from cdiff_cli.yaml_files import Document, Strict
 
@@ -24,7 +24,7 @@ class Kind(Protocol):
     kind: str
 
     def coordinates(self) -> Iterator[tuple[Location, str]]: ...
-    def compile(self, layout: Layout) -> Part: ...
+    def compile(self, layout: Layout) -> TrajectoryConstraint: ...
     def describe(self) -> str: ...
 
 
@@ -35,7 +35,7 @@ def kinds() -> tuple[type[Strict], ...]:
         Quadratic,
         Dcbf,
         Dynamics,
-        RateLimit,
+        RateSpec,
         *(entry.load() for entry in entry_points(group="cdiff.constraints")),
     )
 
@@ -100,8 +100,8 @@ def load_constraints(
                     "the checkpoint has no linear dynamics: too few of its demonstrations' steps are linear in state and input; "
                     "give A, B and inputs instead",
                 )
-            named = Dynamics.of(dynamics, layout, named.name, named.tolerance)
-        if isinstance(named, RateLimit):
+            named = Dynamics.from_dynamics(dynamics, layout, named.name, named.tolerance)
+        if isinstance(named, RateSpec):
             if dt is None:
                 raise document.error(
                     ("constraints", i, "kind"),

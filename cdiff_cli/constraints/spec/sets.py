@@ -7,10 +7,10 @@ import torch
 from pydantic import Field, PlainSerializer, WithJsonSchema, WrapValidator, model_validator
 from torch import Tensor
 
-from cdiff_cli.constraints.observed import Observed, Seen, carried
-from cdiff_cli.constraints.state_sets import Affine, Ellipsoid, Level, Quadric
-from cdiff_cli.constraints.trajectory import Part
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.observed import Observed, ObservedValues, carried
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, StateSet
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.yaml_files import Strict
 
 Location = tuple[str | int, ...]
@@ -52,7 +52,7 @@ Hold = Annotated[
     bool | None,
     Field(description="true: the set is taken to stay where it is observed, whatever its velocity"),
 ]
-NOTHING: Seen = {}
+NOTHING: ObservedValues = {}
 
 
 class Linear(Strict):
@@ -85,17 +85,17 @@ class Linear(Strict):
         """Where the name of an observed quantity stands."""
         yield from names_in({"a": self.a, "b": self.b, "velocity": self.velocity})
 
-    def level(self, layout: Layout, seen: Seen = NOTHING) -> Level:
-        return Affine(vector(self.a, layout, seen), _filled(self.b, seen))
+    def level(self, layout: Layout, seen: ObservedValues = NOTHING) -> StateSet:
+        return HalfSpace(vector(self.a, layout, seen), _filled(self.b, seen))
 
-    def compile(self, layout: Layout) -> Part:
+    def compile(self, layout: Layout) -> TrajectoryConstraint:
         return observed_or_not(
             self.name,
             self,
             self.velocity,
             self.hold,
             layout,
-            lambda at, _: Waypoints(self.name, at(0.0)),
+            lambda at, _: AtWaypoints(self.name, at(0.0)),
         )
 
     def describe(self) -> str:
@@ -162,7 +162,7 @@ class Quadratic(Strict):
             }
         )
 
-    def level(self, layout: Layout, seen: Seen = NOTHING) -> Level:
+    def level(self, layout: Layout, seen: ObservedValues = NOTHING) -> StateSet:
         side = 1 if self.side == "outside" else -1
         if self.P is not None:
             assert self.r is not None
@@ -186,14 +186,14 @@ class Quadratic(Strict):
         to_ball = m[..., None] / axes
         return around.pull_back(-(centre * to_ball) @ which, to_ball @ which + (1 - which.sum(0)))
 
-    def compile(self, layout: Layout) -> Part:
+    def compile(self, layout: Layout) -> TrajectoryConstraint:
         return observed_or_not(
             self.name,
             self,
             self.velocity,
             self.hold,
             layout,
-            lambda at, _: Waypoints(self.name, at(0.0)),
+            lambda at, _: AtWaypoints(self.name, at(0.0)),
         )
 
     def describe(self) -> str:
@@ -221,8 +221,8 @@ def observed_or_not(
     velocity: Mapping[str, float | str] | None,
     hold: bool | None,
     layout: Layout,
-    part: Callable[[Callable[[float], Level], Layout], Part],
-) -> Part:
+    part: Callable[[Callable[[float], StateSet], Layout], TrajectoryConstraint],
+) -> TrajectoryConstraint:
     """part(at, layout), at(time) being the level of the shape `time` seconds further than each waypoint; where the shape has
     observed quantities, the part that waits for them.
     """
@@ -232,7 +232,7 @@ def observed_or_not(
     if not names:
         return part(lambda _: shape.level(layout), layout)
 
-    def make(seen: Seen, dt: float, horizon: int) -> Part:
+    def make(seen: ObservedValues, dt: float, horizon: int) -> TrajectoryConstraint:
         level = shape.level(layout, seen)
         if velocity is None:
             return part(lambda _: level, layout)
@@ -267,7 +267,7 @@ def names_in(numbers: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
             yield from (((field, *inner), name) for inner, name in names_in(value))
 
 
-def vector(values: Mapping[str, Any], layout: Layout, seen: Seen = NOTHING) -> Tensor:
+def vector(values: Mapping[str, Any], layout: Layout, seen: ObservedValues = NOTHING) -> Tensor:
     """The numbers in the layout's order, 0 where there is none: [dim], or [batch, 1, dim] where some are observed."""
     wanted = [values.get(name, 0.0) for name in layout]
     if not any(isinstance(value, str) for value in wanted):
@@ -277,7 +277,7 @@ def vector(values: Mapping[str, Any], layout: Layout, seen: Seen = NOTHING) -> T
     return torch.stack([number.expand(shape) for number in numbers], -1)
 
 
-def _filled(value: float | str, seen: Seen) -> Tensor:
+def _filled(value: float | str, seen: ObservedValues) -> Tensor:
     """A number as a tensor, [] or, observed, [batch, 1]."""
     return (
         seen[value].double()[:, None]

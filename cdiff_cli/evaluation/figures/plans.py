@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.trajectory import Constraint, Part
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 
 mpl.use("Agg")
 UNSAFE, FREE = "#d1495b", "#9aa5b1"
@@ -117,7 +117,7 @@ def _frames(
     plt.close(figure)
 
 
-def in_plane(part: Part, task: Any) -> bool:
+def in_plane(part: TrajectoryConstraint, task: Any) -> bool:
     """Whether the part is a set in the plane of the positions, so that it can be drawn there."""
     level = getattr(part, "level", None)
     if level is None or len(task.positions) != 2:

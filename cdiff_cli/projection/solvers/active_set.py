@@ -21,7 +21,7 @@ from torch import Tensor
 
 from cdiff_cli.projection.solvers.lq_tracking import Tracking
 
-GIVE_U, GIVE_P = (
+SLACK_INPUT, SLACK_ROW = (
     5e-4,
     2e-6,
 )  # of a row by its multiplier: who gives way, inputs or positions, where not all rows can be met
@@ -30,7 +30,7 @@ PIVOTS, PATIENCE = (
     200,
     12,
 )  # changes of the active set at most; those without fewer wrong rows, before they go one at a time
-CONTRADICTED = 1e-3  # violation of active rows that all push from which they turn soft, and up to which soft ones turn hard again
+INFEASIBLE_ABOVE = 1e-3  # violation of active rows that all push from which they turn soft, and up to which soft ones turn hard again
 SOFTLY, AGAIN = (
     30,
     2,
@@ -47,7 +47,7 @@ class Bounds(NamedTuple):
     tolerance: float
 
 
-class Open(NamedTuple):
+class ActiveSetProblem(NamedTuple):
     """Plans whose active set is sought. A step has so many rows: bounds of its inputs, half-spaces of the state that it leads to.
 
     w0      the unconstrained trajectories   [n, steps, width]
@@ -71,8 +71,8 @@ class Open(NamedTuple):
     left: Tensor
     tries: Tensor
 
-    def of(self, which: Tensor) -> "Open":
-        return Open(*(v[which] for v in self))
+    def select(self, which: Tensor) -> "ActiveSetProblem":
+        return ActiveSetProblem(*(v[which] for v in self))
 
 
 @lru_cache(maxsize=16)
@@ -84,11 +84,11 @@ def places(
     if slots:
         place = torch.cat((place, torch.tensor(used)[:, None].expand(-1, slots)), 1)
     place = place[:, None] + (torch.arange(steps) * width)[:, None]
-    give = torch.tensor([GIVE_U] * m + [GIVE_P] * slots, dtype=torch.float64).repeat(steps)
+    give = torch.tensor([SLACK_INPUT] * m + [SLACK_ROW] * slots, dtype=torch.float64).repeat(steps)
     return place.flatten(1).to(device), give.to(device)
 
 
-def settle(
+def solve(
     track: Tracking, w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The nearest w to the unconstrained w0 [batch, steps, n + m] within the bounds and a.x <= b, from that active set.
@@ -107,7 +107,7 @@ def settle(
         was, held, pushes = at.active, at.active != 0, at.active * push > 0
         enter = _foremost(torch.where(held, 0.0, over), len(bounds.low)).sign().to(torch.int8)
         asked = torch.where(pushes, was, enter)
-        wrong, missed = (asked != was).flatten(1).sum(1), over.abs() > CONTRADICTED
+        wrong, missed = (asked != was).flatten(1).sum(1), over.abs() > INFEASIBLE_ABOVE
         proved = (missed & held).flatten(1).any(1) & ~at.soft
         if bool(proved.any()):
             proved &= (held == pushes).flatten(1).all(1)
@@ -125,7 +125,7 @@ def settle(
                 whole[todo[done]] = part
             if not len(going):
                 return out
-            todo, at = todo[going], at.of(going)
+            todo, at = todo[going], at.select(going)
             push, over, enter, asked, wrong = (v[going] for v in (push, over, enter, asked, wrong))
         slow = at.left < 0
         left = torch.where(slow, at.left, torch.where(wrong < at.fewest, PATIENCE, at.left - 1))
@@ -139,7 +139,9 @@ def settle(
         w, push = _at_active(track, at, bounds)
 
 
-def _opened(w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor) -> Open:
+def _opened(
+    w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, soft: Tensor
+) -> ActiveSetProblem:
     """All plans of a batch, as settle() is given them."""
     (batch, steps, slots, terms), m = a.shape, len(bounds.low)
     slope = w0.new_zeros(batch, terms if slots else 1, steps, m + slots)
@@ -151,7 +153,7 @@ def _opened(w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, so
         ends[0, ..., m:], ends[1, ..., m:] = -torch.inf, b
     left = torch.full((batch,), PATIENCE, device=w0.device)
     tries, none = torch.where(soft, AGAIN, PIVOTS), torch.zeros_like(ends[0])
-    at = Open(
+    at = ActiveSetProblem(
         w0,
         slope,
         none,
@@ -167,7 +169,7 @@ def _opened(w0: Tensor, bounds: Bounds, a: Tensor, b: Tensor, active: Tensor, so
     return at._replace(value0=_values(w0, at, bounds))
 
 
-def _values(w: Tensor, at: Open, bounds: Bounds) -> Tensor:
+def _values(w: Tensor, at: ActiveSetProblem, bounds: Bounds) -> Tensor:
     """What w makes of each row [n, steps, rows]."""
     m = len(bounds.low)
     u = w[..., -m:]
@@ -218,7 +220,7 @@ def _one_at_a_time(
     return torch.where(right, torch.where(first, enter, active), torch.where(gone, 0, active)), kept
 
 
-def _at_active(track: Tracking, at: Open, bounds: Bounds) -> tuple[Tensor, Tensor]:
+def _at_active(track: Tracking, at: ActiveSetProblem, bounds: Bounds) -> tuple[Tensor, Tensor]:
     """w with the active rows met, and the multipliers y of all rows: w = w0 - K C^T y, (C K C^T + give) y = C w0 - bound. Of plans
     that are not soft, give hardly counts.
     """

@@ -19,27 +19,27 @@ from cdiff_cli.projection.solvers import riccati, second_order_cone
 STEPS = 50  # of Newton at most
 RIDGE = 1e-9  # on the inputs
 NEAR = 0.995  # share of the way to the boundary that a step goes
-BEGIN = 0.1  # how far within its cone a slack is at least, and its product with the multiplier, at the beginning
+INITIAL_SLACK = 0.1  # how far within its cone a slack is at least, and its product with the multiplier, at the beginning
 SMALL = 1e-12  # mean product of slacks and multipliers, and largest residual, at which it ends
 STUCK = 1e-8  # share of a step from which no more is to be had
 
 
-class Limits(NamedTuple):
+class ConicLimits(NamedTuple):
     """o + L q in a cone, at each waypoint   o [batch | 1, horizon | 1, c, k + 1], L [batch | 1, horizon | 1, c, k + 1, n + m]"""
 
     L: Tensor
     o: Tensor
 
-    def of_steps(self, horizon: int) -> "Limits":
+    def of_steps(self, horizon: int) -> "ConicLimits":
         """Of each step the same L [c, k + 1, n + m] and o [c, k + 1]; after the last state there is no step."""
         L, o = (v.repeat(1, horizon, *(1,) * v.ndim) for v in self)
         L[:, -1], o[:, -1] = 0.0, 0.0
         o[:, -1, :, 0] = 1.0
-        return Limits(L, o)
+        return ConicLimits(L, o)
 
-    def take(self, which: Tensor) -> "Limits":
+    def select(self, which: Tensor) -> "ConicLimits":
         """Of some trajectories of the batch alone."""
-        return Limits(*(v[which] if len(v) > 1 else v for v in self))
+        return ConicLimits(*(v[which] if len(v) > 1 else v for v in self))
 
     def __call__(self, q: Tensor) -> Tensor:
         """[batch, horizon, c, k + 1]"""
@@ -108,10 +108,10 @@ class Moment(NamedTuple):
         return L.flatten(2, 3).mT @ of_columns.solve(L.mT).mT.flatten(2, 3)
 
 
-def nearest(
+def solve(
     A: Tensor,
     B: Tensor,
-    limits: Sequence[Limits],
+    limits: Sequence[ConicLimits],
     z: Tensor,
     weight: Tensor,
     begin: Tensor,
@@ -137,7 +137,10 @@ def nearest(
     at = Iterate(
         begin,
         slacks,
-        [BEGIN * second_order_cone.flip(v) / second_order_cone.determinant(v) for v in slacks],
+        [
+            INITIAL_SLACK * second_order_cone.flip(v) / second_order_cone.determinant(v)
+            for v in slacks
+        ],
         torch.zeros_like(z[:, 0]),
     )
     todo = torch.ones(batch, dtype=torch.bool, device=z.device)
@@ -176,7 +179,7 @@ def nearest(
 
 
 def _step(
-    limits: Sequence[Limits],
+    limits: Sequence[ConicLimits],
     now: Sequence[Moment],
     slope: Tensor,
     minimiser: Callable[[Tensor], Tensor],
@@ -253,7 +256,11 @@ def _gap(s: Sequence[Tensor], y: Sequence[Tensor]) -> Tensor:
 def _inside(s: Tensor) -> Tensor:
     """s, with s_0 raised where it is not well inside."""
     return torch.cat(
-        (torch.maximum(s[..., :1], s[..., 1:].norm(dim=-1, keepdim=True) + BEGIN), s[..., 1:]), -1
+        (
+            torch.maximum(s[..., :1], s[..., 1:].norm(dim=-1, keepdim=True) + INITIAL_SLACK),
+            s[..., 1:],
+        ),
+        -1,
     )
 
 
@@ -262,7 +269,7 @@ def _first(x: Tensor) -> Tensor:
     return torch.cat((x[..., :1], torch.zeros_like(x[..., 1:])), -1)
 
 
-def _moment(limits: Limits, q: Tensor, s: Tensor, y: Tensor, soft: float) -> Moment:
+def _moment(limits: ConicLimits, q: Tensor, s: Tensor, y: Tensor, soft: float) -> Moment:
     scaling = second_order_cone.scaling(s, y)
     first = scaling.over_twice(_first(torch.ones_like(s)))
     return Moment(

@@ -12,7 +12,7 @@ WIDE = 8  # width of the windows round runs of falls from which on their search 
 SWEEPS = 3  # of that search; what they leave, the next round takes
 
 
-def _nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: int) -> Rows:
+def nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: int) -> Rows:
     """min sum_k w_k (v_k - h_k)^2  s.t.  v_{k+1} >= gamma v_k, v_k = h_k outside first to last.
 
     In y_k = v_k / gamma^k this is isotonic regression: pooled adjacent violators. The fixed ends bound it, and a bounded
@@ -34,7 +34,7 @@ def _nearest_between(h: Rows, gamma: float, weight: Tensor, first: int, last: in
     best, _ = pool_violators(h[:, first:last].double(), gamma, weight[..., first:last].double())
     if last - first == n:
         return best.to(h)
-    power = _powers(gamma, last - first, best)[1:]
+    power = powers(gamma, last - first, best)[1:]
     if first > 0:
         best = torch.maximum(best, power * h[:, first - 1 : first])
     if (
@@ -194,7 +194,7 @@ def _reach(
     return taken.add_(low).flatten()
 
 
-def _powers(gamma: float, n: int, like: Tensor) -> Tensor:
+def powers(gamma: float, n: int, like: Tensor) -> Tensor:
     """gamma^0, ..., gamma^n."""
     return _scales(gamma, n, like.dtype, like.device)[n:]
 

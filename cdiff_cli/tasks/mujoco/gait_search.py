@@ -15,6 +15,7 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -287,9 +288,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = asked.out or home() / "models" / task.name / "expert.json"
     policies = []
     for seed in asked.seed:
-        found = search_gait(
-            task, search, seed, lambda text, seed=seed: _tell(f"seed {seed}: {text}")
-        )  # type: ignore[misc]
+        found = search_gait(task, search, seed, partial(_tell_seed, seed))
         if found is None:
             _tell(f"seed {seed}: given up, under {search.at_least:g}")
             continue
@@ -306,6 +305,10 @@ def dump(name: str, policies: Sequence[dict[str, Any]]) -> str:
     """JSON with one line a row of W."""
     text = json.dumps({"task": name, "policies": policies}, indent=1)
     return text + "\n"
+
+
+def _tell_seed(seed: int, text: str) -> None:
+    _tell(f"seed {seed}: {text}")
 
 
 def _tell(text: str) -> None:

@@ -20,7 +20,7 @@ from rich.table import Table
 from scipy import sparse
 from timing import milliseconds
 
-from cdiff_cli.projection.solvers.isotonic import _nearest_between, pool_violators
+from cdiff_cli.projection.solvers.isotonic import nearest_between, pool_violators
 
 INTERIOR_POINT = {"cvxopt", "kvxopt", "qpax", "qtqp", "ecos", "clarabel"}
 DATA = ("noise", "walk", "smooth")
@@ -29,7 +29,7 @@ HARD = ("smooth and noise", "falling", "feasible", "drop after a rise", "peak be
 
 def nearest_chain(h: torch.Tensor, gamma: float, weight: torch.Tensor) -> torch.Tensor:
     """With nothing fixed."""
-    return _nearest_between(h, gamma, weight, 0, h.shape[1])
+    return nearest_between(h, gamma, weight, 0, h.shape[1])
 
 
 def draw(kind: str, batch: int, n: int) -> torch.Tensor:

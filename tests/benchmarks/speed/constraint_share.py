@@ -10,7 +10,7 @@ import argparse
 import statistics
 from pathlib import Path
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.sampling.methods import METHODS
 
@@ -31,7 +31,7 @@ print(
 print(f"{'preset':12} {'method':12} {'network / ms':>14} {'outside / ms':>14} {'share / %':>10}")
 for preset in arguments.presets.split(","):
     for method in arguments.methods.split(","):
-        options = Options(
+        options = Request(
             task=arguments.task,
             method=method,
             preset=preset,

@@ -26,12 +26,12 @@ from rich.console import Console
 from rich.table import Table
 from scipy import sparse
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import pull_back
 from cdiff_cli.models.networks import TemporalUnet
-from cdiff_cli.models.normaliser import Frame
+from cdiff_cli.models.normaliser import ResidualNormaliser
 from cdiff_cli.planning.receding_horizon import Controller, control
 from cdiff_cli.projection.project import project
 
@@ -58,7 +58,9 @@ def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controll
         net(x, x.new_full((len(x),), t))
         return shipped(x[:, :own], t)[:, tau]
 
-    longer = Frame(frame.state, frame.seen, frame.mean[tau], frame.gain[tau], frame.scale[tau])
+    longer = ResidualNormaliser(
+        frame.state, frame.seen, frame.mean[tau], frame.gain[tau], frame.scale[tau]
+    )
     return replace(acting, frame=longer, denoiser=denoiser)
 
 
@@ -146,7 +148,7 @@ def main() -> None:
             title, justify="left" if title in ("task", "preset", "method") else "right"
         )
     for task in asked.task:
-        dim = len(resolve(Options(task=task)).problem.task.layout)
+        dim = len(resolve(Request(task=task)).problem.task.layout)
         net = (
             TemporalUnet(dim, 128, (1, 4, 8), ends=(0,)).eval().requires_grad_(False)
             if asked.paper_size
@@ -157,7 +159,7 @@ def main() -> None:
             *((f"recommended, warm {wa:g}", wa) for wa in asked.warm),
         ):
             each = {
-                m: controller(resolve(Options(task=task, method=m, warm=warm)))
+                m: controller(resolve(Request(task=task, method=m, warm=warm)))
                 for m in asked.methods
             }
             for horizon in asked.paper_size or [None]:

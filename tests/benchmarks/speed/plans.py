@@ -15,8 +15,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Options, resolve
-from cdiff_cli.constraints.dynamics import Reachable
+from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.planning.open_loop import plan
 
@@ -52,7 +52,7 @@ for task in arguments.tasks.split(","):
             for batch in map(int, arguments.batches.split(",")):
                 file = CONSTRAINTS / f"{task}-disc.yaml"
                 resolved = resolve(
-                    Options(
+                    Request(
                         task=task,
                         preset=preset,
                         method="alm",
@@ -64,7 +64,9 @@ for task in arguments.tasks.split(","):
                 problem = resolved.problem
                 if not with_dynamics:
                     kept = tuple(
-                        part for part in problem.enforced.parts if not isinstance(part, Reachable)
+                        part
+                        for part in problem.enforced.parts
+                        if not isinstance(part, LinearDynamicsConstraint)
                     )
                     problem = replace(problem, enforced=Constraint(kept))
                 measured = []

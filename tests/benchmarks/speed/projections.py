@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from timing import milliseconds
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.dynamics import split
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import pull_back
@@ -25,7 +25,7 @@ CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 
 def measure(task: str, batch: int, repeats: int) -> list[str]:
     """The cells of one line of the table."""
-    resolved = resolve(Options(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
     problem, checkpoint = resolved.problem, resolved.checkpoint
     assert checkpoint is not None
     windows = checkpoint.demonstrations.double()

@@ -22,12 +22,12 @@ from rich.table import Table
 from scipy import sparse
 from timing import milliseconds
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.dynamics import LinearDynamics, dynamics_of, split
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import Ellipsoid
-from cdiff_cli.projection.dynamics import nearest_reachable
+from cdiff_cli.projection.dynamics import project_dynamics
 from cdiff_cli.projection.segments import NEVER, planes
 
 CONSTRAINTS = Path(__file__).parents[3] / "constraints"
@@ -36,7 +36,7 @@ FAR = 1e3  # bound of a half-space that is not there, for solvers that want a nu
 
 
 def ours(d, parts, weight, z, pins, warm=None):
-    return nearest_reachable(
+    return project_dynamics(
         d, parts, None, z, pins, used=USED, weight=weight, rounds=1, warm=warm, tolerance=1e-6
     )
 
@@ -175,7 +175,7 @@ class Condensed:
 
 def crossing(task):
     """Dynamics, parts, weight, demonstrations around the disc that the dynamics make, and the task's denoiser."""
-    resolved = resolve(Options(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
     problem = resolved.problem
     windows = resolved.checkpoint.demonstrations.double()
     inside = problem.g(windows) > 0
@@ -274,7 +274,7 @@ def paths(d, horizon, batch):
     aside = torch.stack((-middle[:, 3], middle[:, 2]), 1)
     centre = (middle[:, USED] + 0.95 * size * aside / aside.norm(dim=1, keepdim=True))[:, None]
     level = Ellipsoid(torch.eye(2).double(), centre, size[:, None] * one, size, 1)
-    disc = Segments("disc", level)
+    disc = OnSegments("disc", level)
     return z, disc
 
 

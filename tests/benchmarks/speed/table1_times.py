@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.commands.resolve import Experiment, Request, resolve
 from cdiff_cli.evaluation import tables
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
@@ -36,7 +36,7 @@ Key = tuple[str, str]
 """Method, with its variant, and preset."""
 
 
-def asked(arguments: argparse.Namespace) -> dict[Key, Resolved]:
+def asked(arguments: argparse.Namespace) -> dict[Key, Experiment]:
     """What is timed."""
     common = {
         "task": arguments.task,
@@ -45,21 +45,21 @@ def asked(arguments: argparse.Namespace) -> dict[Key, Resolved]:
         "steps": arguments.steps,
     }
     runs = {
-        (method, "paper"): Options(method=method, preset="paper", **common) for method in METHODS
+        (method, "paper"): Request(method=method, preset="paper", **common) for method in METHODS
     }
     for variant, solver in itertools.product(
         arguments.variants.split(","), ("closed-form", "proxqp")
     ):
         settings = (f"variant={variant}", f"solver={solver}")
-        runs[f"safediffuser {variant}, {solver}", "paper"] = Options(
+        runs[f"safediffuser {variant}, {solver}", "paper"] = Request(
             method="safediffuser", preset="paper", settings=settings, **common
         )
     for preset, method in itertools.product(("recommended", "recommended*"), OURS):
-        runs[method, preset] = Options(method=method, no_dynamics=preset.endswith("*"), **common)
+        runs[method, preset] = Request(method=method, no_dynamics=preset.endswith("*"), **common)
     return {key: resolve(options) for key, options in runs.items()}
 
 
-def step_ms(one: Resolved) -> tuple[float, float]:
+def step_ms(one: Experiment) -> tuple[float, float]:
     """Milliseconds of a diffusion step and, of these, in the network."""
     problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
     plans = plan(problem, one.method, one.seeds, kernel=one.kernel)

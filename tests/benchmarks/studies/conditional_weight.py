@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from acting import act
 
-from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.commands.resolve import Experiment, Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.planning.open_loop import plan
@@ -38,7 +38,7 @@ def told(values: np.ndarray) -> str:
     return f"{values.mean():.4g} ± {values.std(ddof=1) / len(values) ** 0.5:.2g}"
 
 
-def planned(one: Resolved) -> list[str]:
+def planned(one: Experiment) -> list[str]:
     """Cells of whole plans."""
     problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
     plans, free = (
@@ -64,7 +64,7 @@ def planned(one: Resolved) -> list[str]:
     ]
 
 
-def acted(one: Resolved) -> list[str]:
+def acted(one: Experiment) -> list[str]:
     """Cells of episodes."""
     env = {"collide": False} if one.options.task == "ball-run" else {}
     found = act(controller(one), one.seeds, one.problem.g, env)
@@ -98,9 +98,9 @@ def main() -> None:
         "n": asked.n,
         "seed": asked.seed,
     }
-    runs = {"diffuser": Options(method="diffuser", **common)}
+    runs = {"diffuser": Request(method="diffuser", **common)}
     for weight in asked.weights.split(","):
-        runs[weight] = Options(method="conditional", settings=(f"weight={weight}",), **common)
+        runs[weight] = Request(method="conditional", settings=(f"weight={weight}",), **common)
     acts = resolve(runs["diffuser"]).acts
     stem = resolve(runs["diffuser"]).constraints_path.stem
     print(

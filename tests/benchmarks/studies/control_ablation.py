@@ -16,7 +16,7 @@ from acting import act
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.paths import home
 
@@ -76,13 +76,13 @@ def main() -> None:
         "saturation / %",
     ):
         table.add_column(title, justify="left" if title == "change" else "right")
-    truth = resolve(Options(task="ball-run")).problem.g
+    truth = resolve(Request(task="ball-run")).problem.g
     for name, method, change, settings in ROWS:
         with tempfile.TemporaryDirectory() as folder:
             path = varied(change, Path(folder))
             acting = controller(
                 resolve(
-                    Options(
+                    Request(
                         task="ball-run",
                         method=method,
                         constraints=path,

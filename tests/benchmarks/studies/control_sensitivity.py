@@ -29,7 +29,7 @@ from rich.table import Table
 
 from cdiff_cli.commands.calibrate import fit_margins
 from cdiff_cli.commands.margins import Chosen, write_calibration
-from cdiff_cli.commands.resolve import Options, Resolved, resolve
+from cdiff_cli.commands.resolve import Experiment, Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation.conformal import tightened
 from cdiff_cli.paths import home
@@ -40,20 +40,20 @@ STRIDE, APPROACH = 36, 14  # steps: half a stride of Hopper, at most; of an appr
 SETTLED = 500  # step after which every stride is like the last
 
 
-def changed(task: str, alpha: float | None = None, **options: Any) -> Options:
+def changed(task: str, alpha: float | None = None, **options: Any) -> Request:
     """The recommended alm with other options, its barriers at another alpha."""
     path = home() / "constraints" / f"{task}.yaml"
     if alpha is None:
-        return Options(task=task, **options)
+        return Request(task=task, **options)
     content = yaml.safe_load(path.read_text())
     for barrier in content["constraints"]:
         barrier["alpha"] = alpha
     other = Path(tempfile.mkdtemp()) / path.name
     other.write_text(yaml.safe_dump(content))
-    return Options(task=task, constraints=other, **options)
+    return Request(task=task, constraints=other, **options)
 
 
-def fitted(options: Options, keep: bool) -> Resolved:
+def fitted(options: Request, keep: bool) -> Experiment:
     """The problem with margins that were calibrated on it."""
     resolved = resolve(options)
     if resolved.margins.match in ("exact", "unused"):

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.planning.receding_horizon import Controller
@@ -56,8 +56,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    both = {m: controller(resolve(Options(task=NAME, method=m))) for m in ("diffuser", "alm")}
-    recipe = resolve(Options(task=NAME)).recipe
+    both = {m: controller(resolve(Request(task=NAME, method=m))) for m in ("diffuser", "alm")}
+    recipe = resolve(Request(task=NAME)).recipe
     task = both["alm"].task
     episodes = demonstrations(task, recipe.demonstrations.steps, recipe.demonstrations.seed)
     inputs = load_inputs(task, f"cdiff/{NAME}-v0")

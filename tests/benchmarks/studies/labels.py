@@ -16,7 +16,7 @@ from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
 from cdiff_cli.tasks import load_task
 from cdiff_cli.training.demonstrations import demonstrations
-from cdiff_cli.training.labels import Condition
+from cdiff_cli.training.labels import ConstraintLabel
 from cdiff_cli.training.windows import Windows
 
 NEIGHBOURS, KNOWN, ASKED = 10, 40_000, 3_000
@@ -43,7 +43,7 @@ def main() -> None:
     drawn = []
     for chosen, n in ((order[apart:], KNOWN), (order[:apart], ASKED)):
         drawn.append(
-            Windows.of([episodes[i] for i in chosen], recipe.horizon)
+            Windows.from_episodes([episodes[i] for i in chosen], recipe.horizon)
             .draw(n, torch.Generator().manual_seed(1))
             .double()
         )
@@ -53,7 +53,7 @@ def main() -> None:
         "| constraints | windows that obey | told right | variance explained |\n| --- | ---: | ---: | ---: |"
     )
     for path in sorted((home() / "constraints").glob(f"{name}*.yaml")):
-        condition = Condition.read(path, task)
+        condition = ConstraintLabel.read(path, task)
         of_known, truth = (
             torch.cat([condition.label(some) for some in x.split(4096)])[:, 0] > 0 for x in drawn
         )

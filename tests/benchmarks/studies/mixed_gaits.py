@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cdiff_cli.commands.calibrate import calibrate
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.checkpoint import install
 from cdiff_cli.models.recipe import Recipe, load_recipe
@@ -97,7 +97,7 @@ def main() -> None:
     ):
         table.add_column(title, justify="left" if title in ("constraint", "method") else "right")
     for stem in (task.name, f"{task.name}-hard"):
-        asking = Options(
+        asking = Request(
             task=task.name, constraints=Path("constraints") / f"{stem}.yaml", device="cpu"
         )
         calibrate(resolve(replace(asking, n=100, seed=5000, calibrate=True)), lambda *_: None, 0.99)

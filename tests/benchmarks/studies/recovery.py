@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.evaluation.metrics import SAFE
@@ -105,7 +105,7 @@ def recovered(
 ) -> list[str]:
     """Cells of one row."""
     planned = "diffuser" if method == EXPERT else method
-    acting = controller(resolve(Options(task=task, method=planned, n=1, device="cpu")))
+    acting = controller(resolve(Request(task=task, method=planned, n=1, device="cpu")))
     pushing: Any = Pushing(acting.task, value, since, near)
     steps = max(since) + STRIDE + STEPS
     x = (
@@ -152,7 +152,7 @@ def main() -> None:
     torch.set_num_threads(1)
     seeds = range(asked.seed, asked.seed + asked.n)
     since = [0 if asked.standing else 300 + 4 * i for i in range(asked.n)]
-    kind = resolve(Options(task=asked.task, n=1, device="cpu")).kinds[0]
+    kind = resolve(Request(task=asked.task, n=1, device="cpu")).kinds[0]
     limit = kind.barrier.b  # type: ignore[union-attr]
     near = -np.inf if asked.standing else limit - NEAR
     print(f"{asked.task}, limit {limit:g} rad/s, {asked.n} episodes from seed {asked.seed}\n")

@@ -18,7 +18,7 @@ from acting import act
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.denoiser import calls_a_step, guided
 from cdiff_cli.paths import home
@@ -36,12 +36,12 @@ def main() -> None:
     asked = parser.parse_args()
     torch.set_num_threads(1)
     common = {"task": asked.task, "checkpoint": asked.checkpoint, "device": "cpu"}
-    problems = {"none": resolve(Options(method="diffuser", **common))}
+    problems = {"none": resolve(Request(method="diffuser", **common))}
     if asked.limits:
         for name in (asked.task, f"{asked.task}-hard"):
             path = home() / "constraints" / f"{name}.yaml"
             problems[f"alm, {name}"] = resolve(
-                Options(constraints=path, margin=asked.margin, **common)
+                Request(constraints=path, margin=asked.margin, **common)
             )
     seeds = range(asked.seed, asked.seed + asked.episodes)
     table = Table(title=f"{asked.task}: {asked.episodes} episodes from seed {asked.seed}")

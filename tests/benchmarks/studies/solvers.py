@@ -15,7 +15,7 @@ import math
 import numpy as np
 import torch
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.resolve import Request, resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.schedule import Schedule
@@ -112,7 +112,7 @@ def exact_scores(n_steps):
 def trained_model(task, n):
     def plans(kernel, steps):
         resolved = resolve(
-            Options(task=task, method="diffuser", n=n, random=True, kernel=kernel, steps=steps)
+            Request(task=task, method="diffuser", n=n, random=True, kernel=kernel, steps=steps)
         )
         columns = [
             resolved.problem.task.layout.index(name) for name in resolved.problem.task.positions

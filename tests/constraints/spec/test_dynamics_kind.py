@@ -10,13 +10,13 @@ from rich.console import Console
 
 import cdiff_cli.commands.check
 from cdiff_cli.commands.verify import verify_run
-from cdiff_cli.constraints.barrier import Chain
-from cdiff_cli.constraints.dynamics import LinearDynamics, Reachable
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.barrier import DiscreteBarrier
+from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.spec.kinds import Dynamics
 from cdiff_cli.constraints.spec.load import enforced, json_schema, load_constraints
 from cdiff_cli.constraints.state_sets import Ellipsoid
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation.certificate import Saved, certificate
 from cdiff_cli.evaluation.metrics import rollout_metrics
 from cdiff_cli.tasks import load_task
@@ -78,7 +78,7 @@ def test_fit_demonstrations_stands_for_the_checkpoints_dynamics_in_full(tmp_path
         tmp_path, {"kind": "dynamics", "fit": "demonstrations", "tolerance": 0.25}, dynamics=FITTED
     )
     (part,) = g.parts
-    assert isinstance(part, Reachable)
+    assert isinstance(part, LinearDynamicsConstraint)
     assert (kind.name, kind.fit, part.tolerance) == ("dynamics-0", None, 0.25)
     for name, value in vars(FITTED).items():
         assert torch.equal(getattr(part.dynamics, name), value), name
@@ -199,11 +199,14 @@ DISC = f"{{{BALL}, side: outside}}"
 SAFETY = {
     "linear": (
         "{kind: linear, a: {x: 1.0}, b: 1.0}",
-        [Waypoints],
+        [AtWaypoints],
     ),  # its waypoints' safety is its segments' safety
-    "outside a ball": (DISC, [Segments]),
-    "inside a ball": (DISC.replace("outside", "inside"), [Waypoints]),
-    "barrier outside a ball": (f"{{kind: dcbf, alpha: 0.5, barrier: {DISC}}}", [Chain, Segments]),
+    "outside a ball": (DISC, [OnSegments]),
+    "inside a ball": (DISC.replace("outside", "inside"), [AtWaypoints]),
+    "barrier outside a ball": (
+        f"{{kind: dcbf, alpha: 0.5, barrier: {DISC}}}",
+        [DiscreteBarrier, OnSegments],
+    ),
 }
 
 
@@ -227,7 +230,7 @@ def test_a_squared_ball_is_obeyed_on_segments_as_the_ball_it_is(tmp_path):
     kinds, g = load(tmp_path, yaml.safe_load(DISC) | {"form": "squared"})
     (part,) = enforced(kinds, g, "segments").parts
     (ball,) = enforced(*load(tmp_path, yaml.safe_load(DISC)), "segments").parts
-    assert isinstance(part, Segments)
+    assert isinstance(part, OnSegments)
     assert isinstance(part.level, Ellipsoid)
     for name in ("which", "centre", "axes", "m"):
         torch.testing.assert_close(
@@ -256,7 +259,9 @@ def test_a_run_under_dynamics_is_certified_and_one_that_tears_them_is_not(tmp_pa
 
 def test_a_run_of_fitted_dynamics_is_verified_without_its_checkpoint(tmp_path):
     """run.yaml records the matrices that `fit` stood for, to the last bit."""
-    fitted = Dynamics.of(FITTED, LAYOUT, "fitted").model_dump(mode="json", exclude_none=True)
+    fitted = Dynamics.from_dynamics(FITTED, LAYOUT, "fitted").model_dump(
+        mode="json", exclude_none=True
+    )
     x = FITTED.rollout(
         torch.zeros(1, 4, dtype=torch.float64),
         torch.tensor([[[1.0, 0.3], [-1.0, -0.7]]], dtype=torch.float64),
@@ -309,7 +314,7 @@ def test_check_shows_dynamics(entry, tmp_path, monkeypatch):
     )
     load(tmp_path, entry, yaml.safe_load(DISC), dynamics=FITTED)
     out = Console(record=True, width=240)
-    cdiff_cli.commands.check.explain(tmp_path / "own.yaml", tmp_path / "own.png", out)
+    cdiff_cli.commands.check.check(tmp_path / "own.yaml", tmp_path / "own.png", out)
     text = out.export_text()
     assert "each step obeys x' = A x + B u + c" in text
     assert "active set" in text

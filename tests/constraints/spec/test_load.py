@@ -13,8 +13,8 @@ import cdiff_cli.constraints.spec.kinds
 import cdiff_cli.constraints.spec.load
 import cdiff_cli.constraints.spec.sets
 from cdiff_cli.constraints.spec.load import json_schema, load_constraints
-from cdiff_cli.constraints.state_sets import Affine
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.state_sets import HalfSpace
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import SpecError
 from cdiff_cli.tasks import TASKS, load_task
 from cdiff_cli.yaml_files import Strict
@@ -357,7 +357,7 @@ class Floor(Strict):
 
     def compile(self, layout):
         a = torch.tensor([-1.0 if name == "x" else 0.0 for name in layout], dtype=torch.float64)
-        return Waypoints(self.name, Affine(a, torch.tensor(-self.level, dtype=torch.float64)))
+        return AtWaypoints(self.name, HalfSpace(a, torch.tensor(-self.level, dtype=torch.float64)))
 
     def describe(self) -> str:
         return f"x >= {self.level:g}"

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.constraints.waypoints import Waypoints
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import project
-from cdiff_cli.projection.rate import Slowed
-from cdiff_cli.projection.rate_dynamics import nearest_paced, nearest_slowed
+from cdiff_cli.projection.rate import RateProjection
+from cdiff_cli.projection.rate_dynamics import project_rate_dynamics, project_rates
 from cdiff_cli.projection.solvers import riccati, second_order_cone
 from tests.problems import F64, half_space, normal, pin
 from tests.projection.test_rate import rate
@@ -156,11 +156,11 @@ def test_rates_of_single_coordinates_beside_dynamics_end_where_proxqp_does(seed,
         rate(4, (2,), low=-0.6, high=0.8, dt=DT, name="ax"),
         rate(4, (0,), high=0.15, dt=DT, name="vx"),
     ]
-    wall = Waypoints(
+    wall = AtWaypoints(
         "wall", half_space((1.0, 1.0, 0.0, 0.0), 0.01 + float(slow[..., :2].sum(-1).max()))
     )
     pins = pin(z, 0, -1) if goal else pin(z, 0)
-    x, made = nearest_paced(
+    x, made = project_rate_dynamics(
         PUSHED, [wall], rates, z, pins, used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
     )
     torch.testing.assert_close(PUSHED.rollout(still, made), x, atol=1e-9, rtol=0)
@@ -181,7 +181,7 @@ def test_without_dynamics_it_ends_where_admm_does(seed, horizon, held):
     z[:, -1] = z[:, 0] + torch.tensor([0.02, -0.01], dtype=F64) * (horizon - 1) / 2
     pins = pin(z, *held)
     torch.testing.assert_close(
-        nearest_slowed((), limits, z, pins), Slowed(limits, pins)(z), atol=5e-6, rtol=0
+        project_rates((), limits, z, pins), RateProjection(limits, pins)(z), atol=5e-6, rtol=0
     )  # as SMALL**0.5
 
 
@@ -204,7 +204,7 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
     ]
 
     def paced(z):
-        return nearest_paced(
+        return project_rate_dynamics(
             PUSHED, [], limits, z, pin(z, 0), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
         )[0]
 
@@ -220,7 +220,7 @@ def test_where_the_goal_is_too_far_the_limits_hold_and_the_goal_is_missed():
     z = torch.zeros(1, 30, 4, dtype=F64)
     z[:, :, 0] = torch.linspace(0, 1, 30, dtype=F64)
     limits = [rate(4, (0, 1), high=0.2, norm=True, dt=DT)]
-    x, u = nearest_paced(
+    x, u = project_rate_dynamics(
         PUSHED, [], limits, z, pin(z, 0, -1), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
     )
     assert float(limits[0](x).max()) <= 1e-4  # of the limits, as far as they give way
@@ -230,7 +230,7 @@ def test_where_the_goal_is_too_far_the_limits_hold_and_the_goal_is_missed():
 
 def test_nothing_to_plan_comes_back():
     for z in (torch.zeros(0, 5, 4, dtype=F64), torch.zeros(2, 1, 4, dtype=F64)):
-        x, u = nearest_paced(
+        x, u = project_rate_dynamics(
             PUSHED, [], [], z, Pins.none(z), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
         )
         assert (x.shape, u.shape) == (z.shape, (len(z), z.shape[1] - 1, 2))
