@@ -11,6 +11,7 @@ from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.dynamics import project_dynamics
 from cdiff_cli.projection.segments import planes
 from cdiff_cli.projection.solvers.active_set import AGAIN, Bounds, _at_active
+from cdiff_cli.projection.solvers.active_set import solve as settle
 from cdiff_cli.projection.solvers.lq_tracking import tracking
 from tests.problems import F64, ball, normal, num, pin, vec
 from tests.projection.test_dynamics import WEIGHT, distance, maze, noisy_path, qp, solve, trip
