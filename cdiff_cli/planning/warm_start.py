@@ -13,7 +13,7 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.projection.segments import row_blocks
 from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
-from cdiff_cli.sampling.sampler import Method, Step
+from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 
 def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
@@ -36,6 +36,22 @@ class CarriedMultipliers:
     method: Method
     shift: int
     state: Any = None
+
+    @property
+    def enforces(self) -> bool:
+        return self.method.enforces
+
+    @property
+    def polished(self) -> bool:
+        return self.method.polished
+
+    @property
+    def candidates(self) -> int:
+        return self.method.candidates
+
+    @property
+    def planner(self) -> PlannerKind:
+        return self.method.planner
 
     def init(self, x: Traj, g: Constraint) -> Any:
         fresh, last = self.method.init(x, g), self.state

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 
@@ -37,9 +37,31 @@ class Step:
     left: int = 0
 
 
-class Method(Protocol):
-    """A way to obey g <= 0 while sampling: hyper-parameters only, its state is passed in and returned."""
+PlannerKind = Literal["unconditional", "conditional"]
 
+
+class Method(Protocol):
+    """A method acts on g <= 0 in every reverse step; it holds hyper-parameters only, its state is passed in and returned.
+
+    Attributes of the class, which say how a plan made with the method is treated:
+
+    enforces     The sampled plans depend on g, so margins that tighten g change them. False for `diffuser` and `conditional`.
+    polished     The final projection applies to the plans, and a warm plan that violates g is made anew from noise.
+                 False for `diffuser` and `best-of-k`, whose plans stay as the network made them.
+    candidates   Plans sampled per seed, of which the one with the least sum of [g]_+ is kept: k of `best-of-k`, else 1.
+    planner      The checkpoint that it samples from: the task's, or the one trained with constraint labels.
+
+    Only `diffuser` is neither enforcing nor polished: its plans are the unconstrained plans that others are compared with.
+    """
+
+    @property
+    def enforces(self) -> bool: ...
+    @property
+    def polished(self) -> bool: ...
+    @property
+    def candidates(self) -> int: ...
+    @property
+    def planner(self) -> PlannerKind: ...
     def init(self, x: Traj, g: Constraint) -> Any: ...
     def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]: ...
 
