@@ -63,13 +63,6 @@ class CarriedMultipliers:
         x, self.state = self.method.step(step, g, state)
         return x, self.state
 
-    def select(self, which: NDArray[np.bool_]) -> Any:
-        """The state of some of the episodes alone; multipliers that all share are theirs too."""
-        state, some = self.state, torch.from_numpy(which)
-        if isinstance(state, AlmState):
-            return state._replace(lam=state.lam[some] if len(state.lam) == len(some) else state.lam)
-        return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
-
     def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
         """The last rows moved on block by block, the new ones at the end as they begin."""
         if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
@@ -82,3 +75,13 @@ class CarriedMultipliers:
             kept = max(block.stop - block.start - self.shift, 0)
             out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
         return out
+
+
+def select_multipliers(multipliers: Any, episodes: NDArray[np.bool_]) -> Any:
+    """A method's multipliers of some episodes; those that all episodes share are theirs too."""
+    some = torch.from_numpy(episodes)
+    if isinstance(multipliers, AlmState):
+        return multipliers._replace(lam=select_multipliers(multipliers.lam, episodes))
+    if isinstance(multipliers, torch.Tensor) and len(multipliers) == len(some):
+        return multipliers[some]
+    return multipliers
