@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.tasks.protocol import ControlTask
+from cdiff_cli.tasks.protocol import ControlTask, observable_of
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Log:
         self.x, self.planned = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
         self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
         self.foreseen = np.full((n, steps + 1, parts), np.nan)
-        self.observed = {name: np.full((n, steps + 1), np.nan) for name in task.observable}
+        self.observed = {name: np.full((n, steps + 1), np.nan) for name in observable_of(task)}
         self.violation, self.calls = (np.full((n, steps), np.nan) for _ in range(2))
         self.braked = np.zeros((n, steps))
         self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)

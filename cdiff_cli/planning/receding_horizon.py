@@ -30,7 +30,7 @@ from cdiff_cli.sampling.baselines import BestOf
 from cdiff_cli.sampling.kernels import KERNELS
 from cdiff_cli.sampling.methods import Unconstrained
 from cdiff_cli.sampling.sampler import Method, sample
-from cdiff_cli.tasks.protocol import ControlTask
+from cdiff_cli.tasks.protocol import ControlTask, observed_in
 
 TOLERANCE = 1e-3  # of a finished plan's g, environment units: beyond it the projection has found no plan that obeys
 
@@ -144,7 +144,7 @@ def control(
         states = np.stack(
             [task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)]
         )
-        log.observe(0, states, [task.observed(env) for env in envs], np.arange(len(seeds)))
+        log.observe(0, states, [observed_in(task, env) for env in envs], np.arange(len(seeds)))
         alive, plans, since = (
             np.arange(len(seeds)),
             np.empty((len(seeds), controller.horizon, states.shape[1])),
@@ -212,7 +212,7 @@ def control(
                 alive,
                 since or controller.execute,
             )
-            log.observe(tau + 1, states[alive], [task.observed(envs[i]) for i in alive], alive)
+            log.observe(tau + 1, states[alive], [observed_in(task, envs[i]) for i in alive], alive)
             log.end(log.diverged, alive, diverged)
             log.end(log.fell, alive, fell & ~diverged)
             alive = alive[~(fell | diverged)]
