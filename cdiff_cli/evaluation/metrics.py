@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import Task, walls_of
 
 SAFE = 1e-6  # g up to here counts as safe in shares: the rounding of float32 samplers. Certificates allow nothing
 
@@ -148,7 +148,7 @@ def plan_metrics(
             "mean_speed": mean_speed(x, at, task.dt),
             "residual": residual(x, at, rate, task.dt),
             "acceleration": acceleration(x, rate, task.dt),
-            "wall": hits_wall(x, at, task.walls()).astype(np.float64),
+            "wall": hits_wall(x, at, walls_of(task)).astype(np.float64),
         }
     return [{name: float(values[i]) for name, values in columns.items()} for i in range(len(x))]
 

@@ -8,8 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
+<<<<<<< HEAD
 from cdiff_cli.planning.replanning import Plan
 from cdiff_cli.tasks.protocol import ControlTask
+=======
+from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.tasks.protocol import ControlTask, observable_of
+>>>>>>> wip-tasks
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,13 @@ class Log:
         dim, inputs, self.done = len(task.layout), len(task.actions), 0
         self.x, self.predicted = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
         self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
+<<<<<<< HEAD
         self.predicted_levels = np.full((n, steps + 1, parts), np.nan)
         self.observed = {name: np.full((n, steps + 1), np.nan) for name in task.observable}
+=======
+        self.foreseen = np.full((n, steps + 1, parts), np.nan)
+        self.observed = {name: np.full((n, steps + 1), np.nan) for name in observable_of(task)}
+>>>>>>> wip-tasks
         self.violation, self.calls = (np.full((n, steps), np.nan) for _ in range(2))
         self.braked = np.zeros((n, steps))
         self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)

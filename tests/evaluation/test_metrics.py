@@ -225,6 +225,8 @@ def test_plan_metrics_measure_each_plan_in_the_tasks_columns():
         velocities=("vx", "vy"),
         dt=1.0,
         walls=lambda: BOX,
+        footprint=0.0,
+        is_free=lambda *_: True,
     )
     g = Constraint((AtWaypoints("left", HalfSpace(vec(1.0, 0.0, 0.0, 0.0), num(1.0))),))
     x = np.zeros((2, 2, 4))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.tasks.protocol import walls_of
 
 mpl.use("Agg")
 UNSAFE, FREE = "#d1495b", "#9aa5b1"
@@ -128,7 +129,7 @@ def in_plane(part: TrajectoryConstraint, task: Any) -> bool:
 
 
 def draw_maze(axis: Any, task: Any) -> None:
-    for x0, y0, x1, y1 in task.walls():
+    for x0, y0, x1, y1 in walls_of(task):
         axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, color="#3d4451", lw=0, zorder=1))
 
 
@@ -170,7 +171,7 @@ def _columns(task: Any) -> list[int]:
 
 
 def _extent(task: Any) -> tuple[float, float, float, float]:
-    walls = task.walls()
+    walls = walls_of(task)
     if len(walls) == 0:
         return -4.0, 4.0, -4.0, 4.0
     return walls[:, 0].min(), walls[:, 2].max(), walls[:, 1].min(), walls[:, 3].max()
