@@ -110,7 +110,7 @@ def plan(
             kernel=KERNELS[kernel],
             extra_steps=extra_steps,
             on_step=record,
-        )
+        ).x
         if not bool(torch.isfinite(z).all()):
             bad = [
                 seed for seed, x in zip(seeds, z, strict=True) if not bool(torch.isfinite(x).all())

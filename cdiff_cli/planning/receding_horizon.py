@@ -389,7 +389,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
             kernel=KERNELS[controller.kernel],
             extra_steps=controller.extra_steps,
             first=first,
-        )
+        ).x
         y64 = y.double().cpu()
         inside = (
             obeyed
