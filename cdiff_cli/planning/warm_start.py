@@ -25,6 +25,55 @@ def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
     return y
 
 
+def carry(method: Method, last: Any, g: Constraint, x: Traj, executed: int) -> Any:
+    """State that the method begins the next plan with: fresh, but with the multipliers that the last plan ended with.
+
+    The multipliers move forward by the executed waypoints, block by block, and those of the new waypoints begin at zero.
+    Begun at zero altogether, they would have to be found again in the few steps of a warm-started plan.
+    A penalty weight begins anew. Multipliers of another number of rows or plans are dropped.
+
+    last       state after the last step of the last plan, of the same plans in the same order; None: begin afresh
+    g          the constraint that sample() is given
+    x          any tensor of the plans' shape [batch, horizon, dim], type and device
+    executed   waypoints by which the present plan begins later than the last
+    """
+    fresh = method.init(x, g)
+    if isinstance(fresh, AlmState):
+        lam = last.lam if isinstance(last, AlmState) else None
+        return fresh._replace(lam=_moved(method, fresh.lam, lam, g, x.shape[1], executed))
+    return (
+        _moved(method, fresh, last, g, x.shape[1], executed)
+        if isinstance(fresh, torch.Tensor)
+        else fresh
+    )
+
+
+def select(state: Any, plans: NDArray[np.bool_]) -> Any:
+    """State of some of the plans; multipliers shared by all plans stay as they are.
+
+    plans   which of them   [batch]
+    """
+    if isinstance(state, AlmState):
+        return state._replace(lam=select(state.lam, plans))
+    if isinstance(state, torch.Tensor) and len(state) == len(plans):
+        return state[torch.from_numpy(plans)]
+    return state
+
+
+def _moved(
+    method: Method, fresh: Rows, last: Any, g: Constraint, horizon: int, executed: int
+) -> Rows:
+    """The last multipliers moved forward block by block; new rows at the end of a block stay as in `fresh`."""
+    if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
+        return fresh
+    out = fresh.clone()
+    planes = isinstance(method, PrimalDual | AugmentedLagrangian) and method.on != "noisy"
+    for block in row_blocks(g, horizon, planes):
+        kept = max(block.stop - block.start - executed, 0)
+        out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
+    return out
+
+
 @dataclass
 class CarriedMultipliers:
     """The method, begun with the multipliers that the last plan ended with, moved on by `tighten` waypoints: reset, they would have
@@ -54,34 +103,11 @@ class CarriedMultipliers:
         return self.method.planner
 
     def init(self, x: Traj, g: Constraint) -> Any:
-        fresh, last = self.method.init(x, g), self.state
-        if isinstance(fresh, AlmState) and isinstance(last, AlmState):
-            return fresh._replace(lam=self._moved(fresh.lam, last.lam, g, x.shape[1]))
-        return self._moved(fresh, last, g, x.shape[1]) if isinstance(fresh, torch.Tensor) else fresh
+        return carry(self.method, self.state, g, x, self.shift)
 
     def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
         x, self.state = self.method.step(step, g, state)
         return x, self.state
 
-    def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on block by block, the new ones at the end as they begin."""
-        if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
-            return fresh
-        out, planes = (
-            fresh.clone(),
-            isinstance(self.method, PrimalDual | AugmentedLagrangian) and self.method.on != "noisy",
-        )
-        for block in row_blocks(g, horizon, planes):
-            kept = max(block.stop - block.start - self.shift, 0)
-            out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
-        return out
-
-
-def select_multipliers(multipliers: Any, episodes: NDArray[np.bool_]) -> Any:
-    """A method's multipliers of some episodes; those that all episodes share are theirs too."""
-    some = torch.from_numpy(episodes)
-    if isinstance(multipliers, AlmState):
-        return multipliers._replace(lam=select_multipliers(multipliers.lam, episodes))
-    if isinstance(multipliers, torch.Tensor) and len(multipliers) == len(some):
-        return multipliers[some]
-    return multipliers
+    def select(self, which: NDArray[np.bool_]) -> Any:
+        return select(self.state, which)

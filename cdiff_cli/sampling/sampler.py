@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 
@@ -66,6 +66,13 @@ class Method(Protocol):
     def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]: ...
 
 
+class Sample(NamedTuple):
+    """Plans x_0, normalised [batch, horizon, dim], and the method's state after its last step."""
+
+    x: Traj
+    state: Any
+
+
 def sample(
     denoiser: Denoiser,
     schedule: Schedule,
@@ -77,16 +84,18 @@ def sample(
     kernel: Kernel = ddpm,
     extra_steps: int = 0,
     first: Traj | None = None,
+    state: Any = None,
     on_step: Callable[[int, Step, Traj], None] | None = None,
-) -> Traj:
-    """Plans x_0 in normalised coordinates [batch, horizon, dim].
+) -> Sample:
+    """Draw plans x_0: the only loop over the diffusion steps.
 
     first        x_T, the schedule's noisiest; drawn where None
     extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
+    state        the method's state before its first step; method.init() where None
     on_step      called with the number of network calls so far, the step and x_{t-1}
     """
     x = pins.paint(noise() if first is None else first)
-    state = method.init(x, g)
+    state = method.init(x, g) if state is None else state
     used: Previous | None = None
     for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):
         x0 = pins.paint(denoiser(x, schedule.t[i]))
@@ -111,4 +120,4 @@ def sample(
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)
-    return x
+    return Sample(x, state)

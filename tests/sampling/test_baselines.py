@@ -45,7 +45,7 @@ def plans(method, g):
         g,
         Pins.none(like),
         draws(7, 8, 4, 2),
-    )
+    ).x
 
 
 def test_guidance_pushes_every_row_by_its_weight_violated_or_not():
