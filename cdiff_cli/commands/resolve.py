@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -32,7 +31,7 @@ from cdiff_cli.sampling.kernels import KERNELS
 from cdiff_cli.sampling.methods import METHODS, make_method, settings_of
 from cdiff_cli.sampling.sampler import Method
 from cdiff_cli.tasks import load_task
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import HasExactScore, HasRoutes, Task, observable_of
 
 WHOLE_PLAN_OPTIONS = ("start", "goal", "random", "no_dynamics")
 CONTROL_OPTIONS = ("execute", "warm", "margin", "action_noise", "env", "calibrate")
@@ -65,7 +64,7 @@ def resolve(request: Request) -> Experiment:
     if method.planner == "conditional":
         conditional = load_conditional(kinds, path, loaded.checkpoint)
         weight = preset.methods[request.method]["weight"]
-        planner = as_planner(conditional, task, weight).respaced(preset.sampler.steps)
+        planner = conditioned(planner, as_planner(conditional, task, weight))
     return Experiment(
         request=request,
         task=task,
@@ -103,13 +102,8 @@ def find(request: Request) -> tuple[Task, Recipe]:
     if request.kernel is not None and request.kernel not in KERNELS:
         near = suggestion(request.kernel, KERNELS)
         raise CdiffError(f'no kernel "{request.kernel}"{near}; choose from {", ".join(KERNELS)}')
-    _refuse_ignored_options(request, replans(recipe))
+    _refuse_ignored_options(request, task.control == "receding_horizon")
     return task, recipe
-
-
-def replans(recipe: Recipe) -> bool:
-    """Whether the task plans anew at every step."""
-    return recipe.frame == "relative"
 
 
 def _refuse_ignored_options(request: Request, control: bool) -> None:
@@ -151,17 +145,16 @@ class Loaded:
 def load_planner(task: Task, recipe: Recipe, request: Request) -> Loaded:
     """The unconditional planner of the request."""
     device = choose_device(request.device)
-    exact: Any = task
-    if hasattr(task, "denoiser"):
-        schedule, scale = Schedule.cosine(recipe.n_steps), exact.scale
+    if isinstance(task, HasExactScore):
+        schedule, scale = Schedule.cosine(recipe.n_steps), task.scale
         identity = Normaliser.identity(len(task.layout))
         planner = Planner(
-            denoiser=exact.denoiser(schedule),
+            denoiser=task.denoiser(schedule),
             schedule=schedule,
             normaliser=Normaliser(identity.centre, identity.scale * scale),
             horizon=recipe.horizon,
             coordinates=task.layout,
-            dt=getattr(task, "dt", None),
+            dt=task.dt,
             positions=task.positions,
             device=device,
         )
@@ -175,6 +168,16 @@ def load_planner(task: Task, recipe: Recipe, request: Request) -> Loaded:
 def as_planner(checkpoint: Checkpoint, task: Task, weight: float) -> Planner:
     """The planner of a task's checkpoint."""
     return Planner.from_checkpoint(checkpoint, task.layout, task.dt, task.positions, weight)
+
+
+def conditioned(planner: Planner, conditional: Planner) -> Planner:
+    """The planner with the denoiser of one that was trained on from it for certain constraints."""
+    return replace(
+        planner,
+        denoiser=conditional.denoiser,
+        conditioned_denoiser=conditional.conditioned_denoiser,
+        calls_per_step=conditional.calls_per_step,
+    )
 
 
 def load_conditional(
@@ -226,9 +229,13 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
         {
             "sampler.steps": own.sampler.steps or trained,
             # A conditional planner is guided towards the constraints instead.
-            "sampler.return_weight": 0.0 if method.planner == "conditional" else loaded.return_weight,
+            "sampler.return_weight": 0.0
+            if method.planner == "conditional"
+            else loaded.return_weight,
             "control.env": tuple(sorted(request.env)),
-            "methods": {request.method: settings_of(request.method, make_method(request.method, constants))},
+            "methods": {
+                request.method: settings_of(request.method, make_method(request.method, constants))
+            },
         }
     )
     options = {
@@ -267,17 +274,17 @@ def compile_constraints(
 ) -> tuple[Path, list[Kind], Constraint]:
     """The constraint file, its kinds, and the g(x) <= 0 they declare."""
     path = request.constraints or shown(home() / "constraints" / recipe.constraints)
-    observable = getattr(task, "observable", ())
+    observable = observable_of(task)
     kinds, declared = load_constraints(
         path,
         task.name,
         task.layout,
         loaded.planner.dynamics,
         observable,
-        getattr(task, "dt", None),
+        task.dt,
     )
     limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
-    if limited and replans(recipe):
+    if limited and task.control == "receding_horizon":
         raise CdiffError(
             f'"{limited[0]}": `kind: rate` is for whole plans, '
             f"and {task.name} plans anew at every step; leave it out"
@@ -341,7 +348,7 @@ def ends(
 ) -> tuple[Array | None, Array | None]:
     """The start and goal, parsed or drawn."""
     if request.random:
-        if checkpoint is None or not hasattr(task, "random_point"):
+        if checkpoint is None or not isinstance(task, HasRoutes):
             raise CdiffError(f"--random: {task.name} has no start and goal to draw")
         return random_pairs(task, declared, checkpoint.card, request.n, request.seed)
     return (
@@ -360,7 +367,8 @@ def needed_speed(experiment: Experiment) -> tuple[float, float] | None:
         return None
     if checkpoint is None or experiment.request.random:
         return None
+    if not isinstance(task, HasRoutes):
+        return None
     columns = problem.planner.position_columns
-    on_map: Any = task
-    length = on_map.path_length(problem.start[columns], problem.goal[columns])
+    length = task.path_length(problem.start[columns], problem.goal[columns])
     return length / ((problem.planner.horizon - 1) * task.dt), checkpoint.card.data["speed_q95"]

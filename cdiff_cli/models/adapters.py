@@ -105,7 +105,7 @@ def clipped(denoiser: Denoiser, limit: float = 1.0) -> Denoiser:
 
 def batched(denoiser: Denoiser, size: int) -> Denoiser:
     """The denoiser called with at most `size` plans at a time, for bounded memory."""
-    return lambda x, t: torch.cat([denoiser(part, t) for part in x.split(size)])
+    return lambda x, t: torch.cat([denoiser(part, t) for part in torch.split(x, size)])
 
 
 def _levels(alphas_cumprod: Sequence[float] | Tensor) -> list[float]:

@@ -50,7 +50,9 @@ class Normaliser:
         """
         bottom, top = (torch.as_tensor(np.asarray(v, dtype=np.float64)) for v in (low, high))
         if bottom.shape != top.shape or bottom.ndim != 1 or not bool((bottom < top).all()):
-            raise ValueError(f"expected low < high for every coordinate, found {low} and {high}")
+            raise ValueError(
+                f"expected low < high for every coordinate, found {low!r} and {high!r}"
+            )
         return cls((bottom + top) / 2, (top - bottom) / 2)
 
     def at(self, present: Tensor) -> "Normaliser":

@@ -17,6 +17,8 @@ from cdiff_cli.models.schedule import Schedule
 if TYPE_CHECKING:
     from cdiff_cli.models.checkpoint import Checkpoint
 
+CPU = torch.device("cpu")
+
 InverseDynamics = Callable[[Array, Array], Array]
 """(present states [n, dim], next states [n, dim]) -> inputs [n, m], environment units."""
 
@@ -51,7 +53,7 @@ class Planner:
     inverse_dynamics: InverseDynamics | None = None
     conditioned_denoiser: ObservingDenoiser | None = None
     calls_per_step: int = 1
-    device: torch.device = torch.device("cpu")
+    device: torch.device = CPU
 
     @property
     def dim(self) -> int:

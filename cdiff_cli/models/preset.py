@@ -4,7 +4,7 @@ A preset stands in a recipe. Options change single fields (`Preset.updated`). Th
 run records, what a controller gets, and what a calibration of margins is keyed by.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -98,17 +98,18 @@ class Preset(Strict):
             place[field] = value
         return Preset.model_validate(values)
 
+    def facts(self) -> dict[str, Any]:
+        """What plans depend on, by name: method, its settings, and each field of the sections.
+
+        Of a preset of one method (`of_method`). Whether margins are used is left out.
+        """
+        sections = (self.sampler, self.control, self.enforce)
+        fields = {name: v for section in sections for name, v in section.model_dump().items()}
+        (method,) = self.methods
+        chosen = {"method": method, "settings": self.methods[method]}
+        return chosen | {name: value for name, value in fields.items() if name != "margins"}
+
     def differences(self, other: "Preset") -> list[str]:
-        """Dotted names of the values that differ, but for `control.margins`."""
-        mine, theirs = dict(_leaves(self.model_dump())), dict(_leaves(other.model_dump()))
-        names = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
-        return [name for name in names if name != "control.margins"]
-
-
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of every entry that holds no further ones."""
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+        """Names of the facts that differ."""
+        mine, theirs = self.facts(), other.facts()
+        return [name for name in mine if mine[name] != theirs[name]]

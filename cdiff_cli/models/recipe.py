@@ -176,8 +176,8 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     values = dict(base)
     for name, value in over.items():
         below = values.get(name)
-        both = isinstance(below, dict) and isinstance(value, dict)
-        values[name] = merged(below, value) if both else value
+        nested = isinstance(below, dict) and isinstance(value, dict)
+        values[name] = merged(dict(below or {}), value) if nested else value
     return values
 
 

@@ -8,13 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
-<<<<<<< HEAD
 from cdiff_cli.planning.replanning import Plan
-from cdiff_cli.tasks.protocol import ControlTask
-=======
-from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.tasks.protocol import ControlTask, observable_of
->>>>>>> wip-tasks
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,8 @@ class Log:
         dim, inputs, self.done = len(task.layout), len(task.actions), 0
         self.x, self.predicted = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
         self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
-<<<<<<< HEAD
         self.predicted_levels = np.full((n, steps + 1, parts), np.nan)
-        self.observed = {name: np.full((n, steps + 1), np.nan) for name in task.observable}
-=======
-        self.foreseen = np.full((n, steps + 1, parts), np.nan)
         self.observed = {name: np.full((n, steps + 1), np.nan) for name in observable_of(task)}
->>>>>>> wip-tasks
         self.violation, self.calls = (np.full((n, steps), np.nan) for _ in range(2))
         self.braked = np.zeros((n, steps))
         self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -112,7 +102,9 @@ class Log:
         self.predicted[which, tau] = states
         self.predicted_levels[which, tau] = levels
 
-    def act(self, tau: int, i: int, u: Array, reward: float, info: Mapping[str, Any]) -> None:
+    def act(
+        self, tau: int, i: int, u: NDArray[np.float32], reward: float, info: Mapping[str, Any]
+    ) -> None:
         self.u[i, tau], self.reward[i, tau] = u, reward
         for name, value in info.items():
             if isinstance(value, bool | int | float | np.number | np.bool_):

@@ -89,7 +89,7 @@ def plan(
             kernel=KERNELS[settings.kernel],
             extra_steps=settings.extra_steps,
             on_step=watch,
-        )
+        ).x
         _refuse_divergence(z, seeds)
         z64 = z.double().cpu()
         moved, u = np.zeros(len(seeds)), None

@@ -1,7 +1,6 @@
 """A planning problem with all that sampling needs, its pins, and whether its ends are feasible."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +12,13 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.planner import Planner
-from cdiff_cli.tasks.protocol import Tolerances
+from cdiff_cli.tasks.protocol import HasMap, Task, Tolerances
 
 POLISH_MARGIN = 1e-6
 """The final projection tightens g by this, environment units; larger than every solver's tolerance."""
+
+
+DEFAULT_TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Problem:
     enforced: Constraint
     start: Array | None = None
     goal: Array | None = None
-    tolerances: Tolerances = Tolerances()
+    tolerances: Tolerances = DEFAULT_TOLERANCES
 
     @property
     def normaliser(self) -> Normaliser:
@@ -65,7 +67,7 @@ class Problem:
         return Pins(mask.to(where), values.to(where, dtype))
 
 
-def check_feasible(problem: Problem, task: Any = None) -> None:
+def check_feasible(problem: Problem, task: Task | None = None) -> None:
     """Refuse a start or goal inside a wall of the task or outside the constraints.
 
     Raises CdiffError, or InfeasibleError where a constraint is the reason, before anything is sampled.
@@ -83,11 +85,15 @@ def check_feasible(problem: Problem, task: Any = None) -> None:
             part.pull_back(normaliser.centre, normaliser.scale).refuse_pins(pins, POLISH_MARGIN)
 
 
-def _check_end(problem: Problem, task: Any, name: str, state: Array) -> None:
+def _check_end(problem: Problem, task: Task | None, name: str, state: Array) -> None:
     columns = problem.planner.position_columns
     names = [problem.planner.coordinates[column] for column in columns]
     point = ", ".join(f"{c} = {v:g}" for c, v in zip(names, state[columns], strict=True))
-    if hasattr(task, "is_free") and not task.is_free(state[columns], task.footprint):
+    if (
+        task is not None
+        and isinstance(task, HasMap)
+        and not task.is_free(state[columns], task.footprint)
+    ):
         raise CdiffError(
             f"the {name} ({point}) is inside a wall or touches one; "
             f"choose a free point of {task.name}"

@@ -17,8 +17,8 @@ from cdiff_cli.errors import CdiffError
 from cdiff_cli.planning.episodes import Episodes, Log
 from cdiff_cli.planning.replanning import Plan, Replanner
 from cdiff_cli.planning.timing import candidate_seed
-from cdiff_cli.planning.warm_start import select_multipliers
-from cdiff_cli.tasks.protocol import ControlTask
+from cdiff_cli.planning.warm_start import select
+from cdiff_cli.tasks.protocol import ControlTask, observed_in
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,9 @@ class ControlState:
         """The state of some of the episodes."""
         kept = tuple(one for one, keep in zip(self.streams, episodes, strict=True) if keep)
         plan = None if self.plan is None else self.plan.select(episodes)
-        return replace(self, streams=kept, plan=plan, multipliers=select_multipliers(self.multipliers, episodes))
+        return replace(
+            self, streams=kept, plan=plan, multipliers=select(self.multipliers, episodes)
+        )
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class Controller(Replanner):
             predicted=state.plan.x[:, waypoint],
             predicted_levels=state.plan.levels[:, waypoint],
             used_fallback=state.plan.infeasible,
-            diverged=~np.isfinite(state.plan.x).all(axis=(1, 2)),
+            diverged=np.asarray(~np.isfinite(state.plan.x).all(axis=(1, 2))),
         )
         return u, replace(state, since=waypoint % self.control.execute), info
 
@@ -149,7 +151,7 @@ def rollout(
         states = np.stack(
             [task.observe(env.reset(seed=seed)[0]) for env, seed in zip(envs, seeds, strict=True)]
         )
-        log.observe(0, states, [task.observed(env) for env in envs], alive)
+        log.observe(0, states, [observed_in(task, env) for env in envs], alive)
         while log.done < total and len(alive):
             tau = log.done
             u, state, info = controller.act(state, states[alive], log.now(alive))
@@ -169,7 +171,7 @@ def rollout(
                 log.act(tau, int(i), push, float(reward), extra)
                 fell[row], diverged[row] = terminated, not np.isfinite(states[i]).all()
             log.predict(tau + 1, alive, info.predicted, info.predicted_levels)
-            log.observe(tau + 1, states[alive], [task.observed(envs[i]) for i in alive], alive)
+            log.observe(tau + 1, states[alive], [observed_in(task, envs[i]) for i in alive], alive)
             log.end(log.diverged, alive, diverged)
             log.end(log.fell, alive, fell & ~diverged)
             state, alive = state.select(~(fell | diverged)), alive[~(fell | diverged)]

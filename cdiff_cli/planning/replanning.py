@@ -18,20 +18,24 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.denoiser import Denoiser
+from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.planner import Planner
 from cdiff_cli.models.preset import ControlSettings, SamplerSettings
 from cdiff_cli.planning.problem import POLISH_MARGIN
 from cdiff_cli.planning.timing import Timed, synchronise
-from cdiff_cli.planning.warm_start import CarriedMultipliers, shift_plan
+from cdiff_cli.planning.warm_start import carry, shift_plan
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling.kernels import KERNELS
 from cdiff_cli.sampling.methods import Unconstrained
-from cdiff_cli.sampling.sampler import Method, sample
+from cdiff_cli.sampling.sampler import Method, Sample, sample
 
 INFEASIBLE_ABOVE = 1e-3
 """Value of a finished plan's g, environment units, above which it counts as infeasible."""
 
 Streams = Sequence[Sequence[torch.Generator]]
+
+SAMPLER, CONTROL = SamplerSettings(polish=True), ControlSettings()
+"""Settings of a controller that is given none."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,16 @@ class _Batch(NamedTuple):
         return {name: torch.from_numpy(np.array(v)) for name, v in self.observed.items()}
 
 
+class _Carried(NamedTuple):
+    """Multipliers of the previous plans, and the waypoints executed since; None: begin anew."""
+
+    multipliers: Any = None
+    executed: int = 0
+
+
+AFRESH = _Carried()
+
+
 @dataclass(frozen=True)
 class Replanner:
     """How plans are made while acting.
@@ -110,8 +124,8 @@ class Replanner:
     declared: Constraint
     method: Method
     enforced: Constraint | None = None
-    sampler: SamplerSettings = SamplerSettings(polish=True)
-    control: ControlSettings = ControlSettings()
+    sampler: SamplerSettings = SAMPLER
+    control: ControlSettings = CONTROL
     fallback_action: Callable[[Array], Array] | None = None
     ahead: int = 1
 
@@ -182,11 +196,13 @@ class Replanner:
         """Plans from the states x [n, dim], and the method's multipliers at their end."""
         warm = self.control.warm_start is not None
         last = previous.x if previous is not None and warm else None
-        carries = self.control.carry_multipliers or (last is not None and not self.replans_when_unsafe)
+        carries = self.control.carry_multipliers or (
+            last is not None and not self.replans_when_unsafe
+        )
         shift = self.control.execute if warm else 0
-        method = CarriedMultipliers(self.method, shift, multipliers if carries else None)
         noise = self._noise([stream for episode in streams for stream in episode])
-        return self._plan(method, _Batch(x, observed, last, noise)), method.state
+        before = _Carried(multipliers if carries else None, shift)
+        return self._plan(_Batch(x, observed, last, noise), before)
 
     def _noise(self, streams: Sequence[torch.Generator]) -> Tensor:
         """Noise for whole plans, one stream per plan [n, steps + 1, horizon, dim]."""
@@ -198,16 +214,16 @@ class Replanner:
         """g with what is observed now."""
         return g.bind(batch.observed_values, self.planner.dt or 0.0, self.planner.horizon)
 
-    def _plan(self, method: Method, batch: _Batch) -> Plan:
+    def _plan(self, batch: _Batch, before: _Carried = AFRESH) -> tuple[Plan, Any]:
         """Plans for all; where one cannot be made, the others are made without it.
 
         An episode whose plan cannot be made stays where it is, and counts as infeasible.
         """
         if self.method.candidates > 1:
-            return self._best_of(batch)
+            return self._best_of(batch), None
         began = time.perf_counter()
         try:
-            return self._plan_together(method, batch)
+            return self._plan_together(self.method, batch, before)
         except InfeasibleError:
             if self.fallback_action is None:
                 raise
@@ -216,15 +232,13 @@ class Replanner:
             stay = batch.states[:, None].repeat(self.planner.horizon, 1)
             spent = time.perf_counter() - began
             calls = np.full(1, self.calls)
-            return self._scored(stay, batch, np.ones(1, dtype=bool), calls, spent, 0.0)
-        return self._apart(batch, [np.array([i]) for i in range(n)])
+            return self._scored(stay, batch, np.ones(1, dtype=bool), calls, spent, 0.0), None
+        return self._apart(batch, [np.array([i]) for i in range(n)]), None
 
     def _apart(self, batch: _Batch, groups: Sequence[NDArray[np.intp]]) -> Plan:
         """Plans made group by group, in the order of the episodes."""
         began = time.perf_counter()
-        plans = [
-            self._plan(self.method, batch.select(group, batch.noise[group])) for group in groups
-        ]
+        plans = [self._plan(batch.select(group, batch.noise[group]))[0] for group in groups]
         order = np.argsort(np.concatenate(groups))
         x = np.concatenate([plan.x for plan in plans])[order]
         infeasible = np.concatenate([plan.infeasible for plan in plans])[order]
@@ -237,7 +251,7 @@ class Replanner:
         """The safest of several unconstrained plans per episode: the least sum of [g]_+."""
         n, k = len(batch.states), self.method.candidates
         many = batch.select(np.repeat(np.arange(n), k), batch.noise)
-        plan = self._plan_together(Unconstrained(), many)
+        plan, _ = self._plan_together(Unconstrained(), many)
         g = self._bind(self.satisfied, many)
         unsafe = g(torch.from_numpy(plan.x)).clamp_min(0).sum(1).numpy()
         best = np.nan_to_num(unsafe, nan=np.inf).reshape(n, k).argmin(1) + k * np.arange(n)
@@ -258,7 +272,9 @@ class Replanner:
         violation = g(states).clamp_min(0).sum(1).numpy()
         return Plan(x, levels, violation, infeasible, calls, total_s, network_s)
 
-    def _plan_together(self, method: Method, batch: _Batch) -> Plan:
+    def _plan_together(
+        self, method: Method, batch: _Batch, before: _Carried = AFRESH
+    ) -> tuple[Plan, Any]:
         planner = self.planner
         synchronise(planner.device)
         began = time.perf_counter()
@@ -270,16 +286,19 @@ class Replanner:
             mask = torch.zeros((planner.horizon, planner.dim), dtype=torch.bool)
             mask[0] = True
             pins = Pins(mask, present[:, None] - window.centre)
-            last = None if batch.last is None else shift_plan(window, batch.last, self.control.execute)
+            last = (
+                None if batch.last is None else shift_plan(window, batch.last, self.control.execute)
+            )
             if last is not None and self.replans_when_unsafe:
                 path = torch.cat((present[:, None], (window.centre + last)[:, 1:]), 1)
                 unsafe = (enforced(path) > 0).any(1).numpy()
                 if unsafe.any() and not unsafe.all():
-                    return self._apart(batch, [unsafe.nonzero()[0], (~unsafe).nonzero()[0]])
+                    return self._apart(batch, [unsafe.nonzero()[0], (~unsafe).nonzero()[0]]), None
                 last = None if unsafe.all() else last
-            y, steps = self._sample(timed, method, enforced, window.centre, window.scale, pins, last, batch.noise)
-            y64 = y.double().cpu()
-            y64, outside = self._polished(enforced, window.centre, y64, pins)
+            made, steps = self._sample(
+                timed, method, enforced, window, pins, last, batch.noise, before
+            )
+            y64, outside = self._polished(enforced, window.centre, made.x.double().cpu(), pins)
             x = (window.centre + y64).numpy()
             x[:, 0] = batch.states
             infeasible = np.zeros(len(x), dtype=bool)
@@ -288,7 +307,7 @@ class Replanner:
         synchronise(planner.device)
         spent = time.perf_counter() - began
         calls = np.full(len(x), self.calls_for(steps))
-        return self._scored(x, batch, infeasible, calls, spent, timed.seconds)
+        return self._scored(x, batch, infeasible, calls, spent, timed.seconds), made.state
 
     def _denoiser(self, batch: _Batch, present: Tensor) -> Denoiser:
         conditioned = self.planner.conditioned_denoiser
@@ -301,13 +320,15 @@ class Replanner:
         denoiser: Denoiser,
         method: Method,
         enforced: Constraint,
-        centre: Tensor,
-        scale: Tensor,
+        window: Normaliser,
         pins: Pins,
         last: Tensor | None,
         draws: Tensor,
-    ) -> tuple[Tensor, int]:
-        """Plans y, x = centre + y, and the diffusion steps taken; from the last plans where given.
+        before: _Carried,
+    ) -> tuple[Sample, int]:
+        """Plans y, x = window.centre + y, and the diffusion steps taken.
+
+        They continue the previous plans `last` where those are given.
 
         Sampling works on y = scale z, in environment units: distances are measured there. The
         scales of z differ a hundredfold along the window, and a method on z would leave the first
@@ -316,7 +337,7 @@ class Replanner:
         """
         device = self.planner.device
         like = torch.empty(0, device=device)
-        scale = scale.to(like)
+        centre, scale = window.centre, window.scale.to(like)
         g = pull_back(enforced, centre, torch.ones_like(centre[0, 0])).to(like)
         if self.condensed is not None:
             g = replace(g, condensed=self.condensed.about(centre, like))
@@ -326,18 +347,22 @@ class Replanner:
             schedule = schedule.until(self.denoising_steps)
             a = schedule.alpha_bar[-1]
             first = a**0.5 * last.to(like) + (1 - a) ** 0.5 * next(noise)
-        y = sample(
+        held = Pins(pins.mask.to(device), pins.values.to(like))
+        like_plans = held.values.expand(-1, *held.mask.shape)
+        state = carry(method, before.multipliers, g, like_plans, before.executed)
+        made = sample(
             lambda y, t: scale * denoiser(y / scale, t),
             schedule,
             method,
             g,
-            Pins(pins.mask.to(device), pins.values.to(like)),
+            held,
             lambda: next(noise),
             kernel=KERNELS[self.sampler.kernel],
             extra_steps=self.sampler.extra_steps,
             first=first,
+            state=state,
         )
-        return y, schedule.n_steps
+        return made, schedule.n_steps
 
     def _polished(
         self, enforced: Constraint, centre: Tensor, y: Tensor, pins: Pins

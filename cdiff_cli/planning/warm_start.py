@@ -1,6 +1,5 @@
 """What a plan of receding-horizon control takes over from the last one: the plan itself, moved on, and the multipliers."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.projection.segments import row_blocks
 from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
-from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
+from cdiff_cli.sampling.sampler import Method
 
 
 def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
@@ -72,42 +71,3 @@ def _moved(
         kept = max(block.stop - block.start - executed, 0)
         out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
     return out
-
-
-@dataclass
-class CarriedMultipliers:
-    """The method, begun with the multipliers that the last plan ended with, moved on by `tighten` waypoints: reset, they would have
-    to be found again in the few steps of a warm plan.
-
-    state   of the method after its last step; None to begin anew
-    """
-
-    method: Method
-    shift: int
-    state: Any = None
-
-    @property
-    def enforces(self) -> bool:
-        return self.method.enforces
-
-    @property
-    def polished(self) -> bool:
-        return self.method.polished
-
-    @property
-    def candidates(self) -> int:
-        return self.method.candidates
-
-    @property
-    def planner(self) -> PlannerKind:
-        return self.method.planner
-
-    def init(self, x: Traj, g: Constraint) -> Any:
-        return carry(self.method, self.state, g, x, self.shift)
-
-    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
-        x, self.state = self.method.step(step, g, state)
-        return x, self.state
-
-    def select(self, which: NDArray[np.bool_]) -> Any:
-        return select(self.state, which)

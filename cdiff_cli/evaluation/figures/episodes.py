@@ -36,7 +36,7 @@ def levels_picture(
     )
     time = np.arange(levels.shape[1]) * task.dt
     for k, (axis, part) in enumerate(zip(axes[:, 0], parts, strict=False)):
-        axis.plot(time, -done.foreseen[:, :, k].T, color=FORESEEN, lw=0.6)
+        axis.plot(time, -done.predicted_levels[:, :, k].T, color=FORESEEN, lw=0.6)
         axis.plot(time, -levels[:, :, k].T, color=SAFE, lw=0.7, alpha=0.8)
         axis.axhline(0, color=UNSAFE, lw=1.2)
         axis.set(xlabel="time / s", ylabel=f"h of {part.name}")
