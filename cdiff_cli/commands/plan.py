@@ -22,7 +22,7 @@ from cdiff_cli.evaluation.columns import Row
 from cdiff_cli.evaluation.figures import plans as plan_figures
 from cdiff_cli.machine import device_name, git_commit
 from cdiff_cli.planning.open_loop import Plans, plan
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling.baselines import Unconstrained
 
 Tick = Callable[[str, int, int], None]
 """(what, done, of how many)"""

@@ -27,9 +27,8 @@ from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home, shown
 from cdiff_cli.planning.problem import Problem, check_feasible
 from cdiff_cli.planning.start_goal import parse_state, random_pairs
-from cdiff_cli.sampling.baselines import Conditional
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import METHODS, Unconstrained, make_method, settings_of
+from cdiff_cli.sampling import KERNELS, METHODS, complete_settings, make_method
+from cdiff_cli.sampling.baselines import Conditional, Unconstrained
 from cdiff_cli.sampling.sampler import Method
 from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.protocol import Task
@@ -217,8 +216,8 @@ def resolve(options: Request) -> Experiment:
     _require_applicable(options, recipe.frame == "relative")
     preset = recipe.presets[options.preset]
     settings = {**preset.methods.get(options.method, {}), **parse_settings(options.settings)}
+    settings = complete_settings(options.method, settings)
     method = make_method(options.method, settings)
-    settings = settings_of(options.method, method)
     kernel = options.kernel or preset.kernel
     if kernel not in KERNELS:
         raise CdiffError(

@@ -32,8 +32,7 @@ from cdiff_cli.machine import device_name, git_commit
 from cdiff_cli.planning.episodes import Episodes
 from cdiff_cli.planning.execution import Rollout, follow
 from cdiff_cli.planning.receding_horizon import Controller, control
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
 from cdiff_cli.tasks.protocol import ControlTask
 
 

@@ -16,9 +16,8 @@ from cdiff_cli.errors import CdiffError
 from cdiff_cli.planning.problem import MARGIN, Problem, make_pins
 from cdiff_cli.planning.timing import Timed, candidate_seed, synchronise
 from cdiff_cli.projection.project import project, project_reachable
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
 from cdiff_cli.sampling.noise import Noise
 from cdiff_cli.sampling.sampler import Method, Step, sample
 
@@ -107,7 +106,7 @@ def plan(
             g,
             pins,
             noise,
-            kernel=KERNELS[kernel],
+            kernel=load_kernel(kernel),
             extra_steps=extra_steps,
             on_step=record,
         ).x

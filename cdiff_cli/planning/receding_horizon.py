@@ -26,9 +26,8 @@ from cdiff_cli.planning.problem import MARGIN
 from cdiff_cli.planning.timing import Timed, candidate_seed, synchronise
 from cdiff_cli.planning.warm_start import CarriedMultipliers, shift_plan
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
 from cdiff_cli.sampling.sampler import Method, sample
 from cdiff_cli.tasks.protocol import ControlTask
 
@@ -386,7 +385,7 @@ def _plan_together(controller: Controller, method: Method, asked: _Asked) -> _Fo
             g,
             Pins(mask, begin.to(like)),
             lambda: next(noise),
-            kernel=KERNELS[controller.kernel],
+            kernel=load_kernel(controller.kernel),
             extra_steps=controller.extra_steps,
             first=first,
         ).x

@@ -12,7 +12,7 @@ from cdiff_cli.arrays import Rows, Traj
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.projection.segments import row_blocks
-from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
+from cdiff_cli.sampling.methods import AlmState
 from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 
@@ -67,8 +67,8 @@ def _moved(
     if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
         return fresh
     out = fresh.clone()
-    planes = isinstance(method, PrimalDual | AugmentedLagrangian) and method.on != "noisy"
-    for block in row_blocks(g, horizon, planes):
+    on_clean_estimate = getattr(method, "on", "noisy") != "noisy"
+    for block in row_blocks(g, horizon, planes=on_clean_estimate):
         kept = max(block.stop - block.start - executed, 0)
         out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
     return out

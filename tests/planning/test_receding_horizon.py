@@ -19,8 +19,13 @@ from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.episodes import Episodes
 from cdiff_cli.planning.receding_horizon import Controller, control
 from cdiff_cli.planning.warm_start import CarriedMultipliers
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
+from cdiff_cli.sampling.clean_methods import (
+    CleanAugmentedLagrangian,
+    CleanPrimalDual,
+    CleanProjected,
+)
+from cdiff_cli.sampling.methods import PrimalDual
 from tests.problems import F64, chain, vec
 
 DT, H = 0.1, 6
@@ -140,7 +145,7 @@ def test_an_episode_does_not_depend_on_its_neighbours():
 def test_projected_plans_never_let_the_speed_pass_its_limit():
     free, held = (
         control(FREE, [0, 1]),
-        control(replace(FREE, method=Projected(), polish=True), [0, 1]),
+        control(replace(FREE, method=CleanProjected(), polish=True), [0, 1]),
     )
     assert free.x[:, :, 1].max() > 1.5
     assert held.x[:, :, 1].max() <= 0.75 + 1e-5
@@ -150,7 +155,7 @@ def test_projected_plans_never_let_the_speed_pass_its_limit():
 
 
 def test_a_barrier_approaches_its_limit_no_faster_than_alpha_allows():
-    held = control(replace(FREE, method=Projected(), polish=True), [0])
+    held = control(replace(FREE, method=CleanProjected(), polish=True), [0])
     h = 0.75 - held.x[0, :, 1]
     assert (h[1:] >= 0.5 * h[:-1] - 1e-5).all()
 
@@ -227,7 +232,7 @@ def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
         (AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), torch.tensor(0.01, dtype=F64))),)
     )
     done = control(
-        replace(FREE, method=Projected(), polish=True, g=held, enforced=held), [0], steps=5
+        replace(FREE, method=CleanProjected(), polish=True, g=held, enforced=held), [0], steps=5
     )
     assert done.x[0, 0, 1] > 0.01
     assert done.x[0, 1:, 1].max() <= 0.01 + 1e-5
@@ -239,7 +244,7 @@ def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     narrow += (AtWaypoints("high", HalfSpace(vec(0.0, -1.0), torch.tensor(-0.4, dtype=F64))),)
     never = Constraint(narrow)
     acting = replace(
-        FREE, method=Projected(), polish=True, g=never, enforced=never, brake=lambda x: -x[1:]
+        FREE, method=CleanProjected(), polish=True, g=never, enforced=never, brake=lambda x: -x[1:]
     )
     done = control(acting, [0], steps=5)
     assert (done.braked == 1).all()
@@ -301,7 +306,7 @@ def observed_limit() -> Constraint:
 def test_a_warm_plan_that_no_longer_obeys_what_is_observed_is_made_anew():
     """Plans speed up by 0.1 a step from below 0.1, over five steps: the third or fourth is the first that comes to the limit."""
     told = observed_limit()
-    acting = replace(FREE, method=Projected(), polish=True, warm=0.4, g=told, enforced=told)
+    acting = replace(FREE, method=CleanProjected(), polish=True, warm=0.4, g=told, enforced=told)
     done = control(acting, range(6), steps=5)
     np.testing.assert_array_equal(done.calls[:, :2], [[3, 1]] * 6)
     for i, start in enumerate(done.x[:, 0, 1]):
@@ -375,7 +380,7 @@ def test_a_candidate_that_is_not_finite_is_not_kept():
 
 
 @pytest.mark.parametrize(
-    "method", [Projected(), PrimalDual(), PrimalDual(on="noisy", eta=0.1), AugmentedLagrangian()]
+    "method", [CleanProjected(), CleanPrimalDual(), PrimalDual(eta=0.1), CleanAugmentedLagrangian()]
 )
 def test_rows_as_one_matrix_give_the_plans_that_part_by_part_gives(method, monkeypatch):
     """To 1e-6: the order of additions in float32 differs."""
