@@ -13,7 +13,7 @@ from cdiff_cli.commands.margins import (
     write_calibration,
 )
 from cdiff_cli.paths import home
-from cdiff_cli.sampling.methods import make_method, settings_of
+from cdiff_cli.sampling import complete_settings
 from cdiff_cli.yaml_files import load
 
 NOW = Conditions(
@@ -175,6 +175,4 @@ def test_shipped_calibrations_name_settings_that_their_methods_have():
     for path in sorted((home() / "models").glob("*/*.margins.yaml")):
         for each in load(path, CalibrationFile).calibrated:
             now = each.conditions
-            assert settings_of(now.method, make_method(now.method, now.settings)) == now.settings, (
-                path
-            )
+            assert complete_settings(now.method, now.settings) == now.settings, path

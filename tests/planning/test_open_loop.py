@@ -13,7 +13,9 @@ from cdiff_cli.planning.execution import follow
 from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.planning.problem import POLISH_MARGIN, check_feasible
 from cdiff_cli.planning.start_goal import parse_state
-from cdiff_cli.sampling.methods import Projected, Unconstrained, make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.baselines import Unconstrained
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.tasks import load_task
 
 
@@ -32,14 +34,14 @@ def test_a_plan_of_a_seed_does_not_depend_on_its_batch(umaze):
 def test_projection_on_the_clean_estimate_leaves_a_plan_that_already_obeys_unchanged(umaze):
     loose = replace(umaze.problem, enforced=umaze.problem.declared.tighten(-100.0))
     np.testing.assert_array_equal(
-        plan(loose, Projected(), [0]).x, plan(loose, Unconstrained(), [0]).x
+        plan(loose, CleanProjected(), [0]).x, plan(loose, Unconstrained(), [0]).x
     )
 
 
 def test_polish_ends_a_margin_inside(umaze):
     plans = plan(
         replace(umaze.problem, enforced=umaze.problem.declared),
-        Projected(),
+        CleanProjected(),
         [0, 1],
         SamplerSettings(polish=True),
     )

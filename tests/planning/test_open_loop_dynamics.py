@@ -25,7 +25,8 @@ from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import check_feasible
 from cdiff_cli.projection.project import project_reachable
-from cdiff_cli.sampling.methods import Projected, make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.tasks.maze2d import UMAZE, Maze2D
 from cdiff_cli.tasks.protocol import Tolerances
 
@@ -156,7 +157,7 @@ def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolve
         declared=g,
         enforced=Constraint((*g.parts, *dynamics_of(resolved.problem.enforced))),
     )
-    for method in (Projected(), make_method("alm", {})):
+    for method in (CleanProjected(), make_method("alm", {})):
         plans = plan(problem, method, [0], SamplerSettings(polish=True))
         assert np.abs(plans.x[0, -1] - problem.goal).max() < 1e-3
 

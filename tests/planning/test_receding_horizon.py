@@ -21,8 +21,13 @@ from cdiff_cli.models.preset import ControlSettings, SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.episodes import Episodes
 from cdiff_cli.planning.receding_horizon import Controller, rollout
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
+from cdiff_cli.sampling.clean_methods import (
+    CleanAugmentedLagrangian,
+    CleanPrimalDual,
+    CleanProjected,
+)
+from cdiff_cli.sampling.methods import PrimalDual
 from tests.problems import F64, chain, vec
 
 DT, H = 0.1, 6
@@ -122,7 +127,7 @@ PLANNER = Planner(
     ).numpy(),
 )
 FREE = Controller(PLANNER, LIMIT, Unconstrained(), sampler=PLAIN)
-HELD = replace(FREE, method=Projected(), sampler=POLISHED)
+HELD = replace(FREE, method=CleanProjected(), sampler=POLISHED)
 
 
 def act(controller: Controller, seeds: Sequence[int], env: Any = None, **options: Any) -> Episodes:
@@ -393,7 +398,7 @@ def test_a_candidate_that_is_not_finite_is_not_kept():
 
 
 @pytest.mark.parametrize(
-    "method", [Projected(), PrimalDual(), PrimalDual(on="noisy", eta=0.1), AugmentedLagrangian()]
+    "method", [CleanProjected(), CleanPrimalDual(), PrimalDual(eta=0.1), CleanAugmentedLagrangian()]
 )
 def test_rows_as_one_matrix_give_the_plans_that_part_by_part_gives(method, monkeypatch):
     """To 1e-6: the order of additions in float32 differs."""
