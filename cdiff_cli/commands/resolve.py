@@ -32,7 +32,7 @@ from cdiff_cli.sampling.kernels import KERNELS
 from cdiff_cli.sampling.methods import METHODS, Unconstrained, make_method, settings_of
 from cdiff_cli.sampling.sampler import Method
 from cdiff_cli.tasks import load_task
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import HasExactScore, Task
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def resolve(options: Request) -> Experiment:
     path = options.constraints or shown(home() / "constraints" / recipe.constraints)
     device = choose_device(options.device)
     schedule = Schedule.cosine(recipe.n_steps)
-    if hasattr(task, "denoiser"):
+    if isinstance(task, HasExactScore):
         checkpoint, returns, denoiser, normaliser = (
             None,
             0.0,
