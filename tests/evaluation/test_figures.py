@@ -67,11 +67,12 @@ def test_a_rollout_video_shows_every_second_step(tmp_path):
 
 def test_drawing_changes_no_setting_of_matplotlib(tmp_path):
     code = f"""
-import matplotlib, numpy as np
+import pathlib, matplotlib, numpy as np
 matplotlib.use("svg")
 before = dict(matplotlib.rcParams)
 from cdiff_cli.evaluation.figures import episodes, plans
-plans.convergence_picture(__import__("pathlib").Path({str(tmp_path / "a.png")!r}), {{"a": np.ones((3, 2, 1))}})
+path = pathlib.Path({str(tmp_path / "a.png")!r})
+plans.convergence_picture(path, {{"a": np.ones((3, 2, 1))}})
 assert dict(matplotlib.rcParams) == before
 from matplotlib import pyplot
 assert pyplot.get_backend() == "svg" and pyplot.get_fignums() == []
