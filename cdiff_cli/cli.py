@@ -218,16 +218,6 @@ def train(
     )
 
 
-def options(values: dict[str, Any]) -> Any:
-    """The Options of plan and rollout from a command's local variables."""
-    from dataclasses import fields
-
-    from cdiff_cli.commands.resolve import Request
-
-    values = values | {name: tuple(values.get(name) or ()) for name in ("settings", "env")}
-    return Request(**{f.name: values[f.name] for f in fields(Request) if f.name in values})
-
-
 def finish(finished: Any, table: tuple[str, ...], as_json: bool) -> None:
     """Print a run: its table on stdout, where it lies, its picture, what its certificate says."""
     from cdiff_cli.evaluation.comparison import compare
@@ -317,11 +307,12 @@ def plan(
 ) -> None:
     """Plan trajectories that obey the constraints; writes a run directory and prints its table."""
     given = locals()
+    from cdiff_cli.commands.experiment import Request
     from cdiff_cli.commands.plan import plan_run
     from cdiff_cli.commands.resolve import resolve
     from cdiff_cli.evaluation.columns import PLAN_TABLE
 
-    resolved = resolve(options(given))
+    resolved = resolve(Request.from_options(given))
     warn_of_speed(resolved)
     with progress() as tick:
         finished = plan_run(resolved, runs, tick)
@@ -364,6 +355,7 @@ def rollout(
     given = locals()
     if video not in (None, "gif", "mp4"):
         raise CdiffError(f"--video: expected gif or mp4, found {video}")
+    from cdiff_cli.commands.experiment import Request
     from cdiff_cli.commands.resolve import resolve
     from cdiff_cli.evaluation.columns import (
         CONTROL_TABLE,
@@ -376,8 +368,8 @@ def rollout(
         raise CdiffError("--video: --calibrate writes margins and no run; leave it out")
     if level is not None and not calibrate:
         raise CdiffError("--level: belongs to --calibrate; leave it out, or add that")
-    resolved = resolve(options(given))
-    if resolved.acts:
+    resolved = resolve(Request.from_options(given))
+    if resolved.task.control == "receding_horizon":
         from cdiff_cli.commands.calibrate import calibrate as fit_margins
         from cdiff_cli.commands.calibrate import calibrated_text
         from cdiff_cli.commands.rollout import control_run

@@ -1,8 +1,13 @@
 """Where a result is made: device, versions, commit."""
 
 import contextlib
+import platform
 import subprocess
+import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -38,6 +43,22 @@ def git_commit() -> str:
         ]
         return subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip()
     return "none"
+
+
+def record(device: torch.device, wall_s: float, packages: Sequence[str]) -> dict[str, Any]:
+    """What a run says of its making: command, commit, versions of packages, device, seconds."""
+    installed = {}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            installed[name] = version(name)
+    return {
+        "command": ["cdiff", *sys.argv[1:]],
+        "commit": git_commit(),
+        "versions": installed,
+        "python": platform.python_version(),
+        "device": device_name(device),
+        "wall_s": round(wall_s, 3),
+    }
 
 
 def device_name(device: torch.device) -> str:

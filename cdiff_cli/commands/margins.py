@@ -1,12 +1,14 @@
-"""What margins were calibrated on, kept beside the checkpoint, and which of them a rollout may rely on.
+"""What margins were calibrated on, kept beside the checkpoint, and which of them a rollout may use.
 
-The error between plan and execution depends on all that makes a plan and follows it, so a set of margins is kept with its
-conditions, several of one constraint file side by side. A rollout takes the first of these that there is, and says which:
+The error between plan and execution depends on everything that makes a plan and follows it. A set
+of margins is therefore kept with the preset it was calibrated with; one constraint file may have
+several sets. A rollout takes the first of these that exists, and says which:
 
-exact       the same constraints and all the same conditions
-other       the same constraints: first of the same method, then with the fewest other conditions, then the latest
-renumbered  a file of the same name whose constraints, of the same names, say something else (another alpha, another limit): of
-            those as near otherwise the one with the widest margin
+exact       the same constraints and an equal preset
+other       the same constraints: the same method first, then the fewest differences, then the latest
+renumbered  a file of the same name whose constraints, of equal names, say something else (another
+            alpha, another limit): the same method first, then the fewest differences, then the
+            widest margin
 none        no margin at all
 given       the user's own
 unused      the preset, or the method, asks for none
@@ -21,63 +23,43 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
+from cdiff_cli.models.preset import Preset
 from cdiff_cli.yaml_files import Dumper, Strict, load
 
 Match = Literal["exact", "other", "renumbered", "none", "given", "unused"]
 
 
 class Margin(Strict):
-    """Of one constraint: `margin` in the units of its barrier h; of the last pass's errors, the median and the largest."""
+    """The margin of one constraint, units of its barrier h, and the last pass's errors.
+
+    margin            by which the constraint is tightened
+    median, largest   errors between plan and execution in the last pass
+    """
 
     margin: Annotated[float, Field(ge=0)]
     median: float
     largest: float
 
 
-class Conditions(Strict):
-    """How plans are made and followed: all that the error between plan and execution depends on but the constraints and weights.
-
-    settings   the method's constants;  steps, extra_steps   diffusion steps, and those with t frozen
-    execute, warm, action_noise   as in Controller;  env   options of the environment, as pattern=chaser
-    returns    weight of guidance towards the highest return; 0 without
-    """
-
-    method: str
-    preset: str
-    settings: dict[str, Any]
-    kernel: str
-    steps: int
-    extra_steps: int
-    temperature: float
-    polish: bool
-    execute: int
-    warm: float | None
-    action_noise: float
-    env: tuple[str, ...]
-    returns: float = 0.0
-
-    def unlike(self, other: "Conditions") -> list[str]:
-        """Names of what differs, the preset's apart: it stands for the others."""
-        return [
-            name
-            for name in Conditions.model_fields
-            if name != "preset" and getattr(self, name) != getattr(other, name)
-        ]
-
-
 class Calibration(Strict):
     """One set of margins.
 
-    stem, content  of the constraint file, and the hash of what it said;  constraints  that in words, by name
-    level          an episode that is exchangeable with those stays within the margins with at least this probability
-    episodes, seed number of calibration episodes of a pass, the first one's seed
-    passes         until margins covered what happens to plans that keep them
+    stem          name of the constraint file without its ending
+    content       hash of the constraints as read
+    constraints   the constraints in words, by name
+    method        whose plans were followed
+    preset        how they were made and followed, with that method's constants alone
+    level         probability that an episode exchangeable with those stays within the margins
+    episodes      calibration episodes per pass
+    passes        until the margins covered the errors of plans that keep them
+    seed          of the first episode
     """
 
     stem: str
     content: str
     constraints: dict[str, str]
-    conditions: Conditions
+    method: str
+    preset: Preset
     level: Annotated[float, Field(gt=0, lt=1)]
     episodes: int
     passes: int = 1
@@ -93,11 +75,11 @@ class CalibrationFile(Strict):
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """The margins that a rollout uses, of each constraint by its name.
+class ChosenMargins:
+    """The margins that a rollout uses, by the constraint's name.
 
-    match    how well the calibration fits, as above
-    unlike   conditions that it was made under and are others now
+    match    how well the calibration fits, as in the module's table
+    unlike   names of what differs from the present preset
     """
 
     margins: Mapping[str, float]
@@ -105,18 +87,15 @@ class Chosen:
     calibration: Calibration | None = None
     unlike: tuple[str, ...] = ()
 
-    def told(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """For run.yaml."""
-        found = self.calibration
-        where = (
-            {}
-            if found is None
-            else {"calibrated": found.model_dump(mode="json", exclude={"margins"})}
-        )
-        return {"match": self.match, "unlike": list(self.unlike)} | where
+        record: dict[str, Any] = {"match": self.match, "unlike": list(self.unlike)}
+        if self.calibration is not None:
+            record["calibrated"] = self.calibration.model_dump(mode="json", exclude={"margins"})
+        return record
 
-    def note(self, now: Conditions, stem: str, command: str) -> str:
-        """One line for the user where the margins were not calibrated on what is asked for; nothing where they were."""
+    def note(self, now: Preset, stem: str, command: str) -> str:
+        """One line where the margins were not calibrated for this preset; else nothing."""
         fit = f"; fit margins with `{command}`"
         if self.match in ("exact", "given", "unused"):
             return ""
@@ -127,46 +106,42 @@ class Chosen:
                 f"{name}: {text}" for name, text in self.calibration.constraints.items()
             )
             return f"note: the margins were calibrated when {stem} said {said}{fit}"
-        then = self.calibration.conditions
-        each = ", ".join(
-            f"{name} {_shown(then, name)} (now {_shown(now, name)})" for name in self.unlike
+        before, present = self.calibration.preset.facts(), now.facts()
+        differences = ", ".join(
+            f"{name} {_shown(before[name])} (now {_shown(present[name])})" for name in self.unlike
         )
-        return f"note: the margins were calibrated with {each}{fit}"
+        return f"note: the margins were calibrated with {differences}{fit}"
 
 
-NONE = Chosen({}, "none")
+NONE = ChosenMargins({}, "none")
 
 
-def choose(
+def choose_margins(
     calibrations: Sequence[Calibration],
     weights_sha256: str,
     stem: str,
     content: str,
-    now: Conditions,
-) -> Chosen:
-    """The margins to use with these weights, of constraints with that content in a file of that stem, under those conditions."""
-    known = [each for each in calibrations if each.weights_sha256 == weights_sha256]
-    same = [each for each in known if each.content == content]
-    renumbered = [each for each in known if each.stem == stem]
+    method: str,
+    preset: Preset,
+) -> ChosenMargins:
+    """The margins to use with these weights, for these constraints, this method and this preset."""
+    known = [one for one in calibrations if one.weights_sha256 == weights_sha256]
+    same = [one for one in known if one.content == content]
+    renumbered = [one for one in known if one.stem == stem]
 
-    def nearness(each: Calibration) -> tuple[bool, int]:
-        return each.conditions.method == now.method, -len(each.conditions.unlike(now))
+    def nearness(one: Calibration) -> tuple[bool, int]:
+        return one.method == method, -len(one.preset.differences(preset))
 
-    def widest(each: Calibration) -> tuple[bool, int, float]:
-        return *nearness(each), max(
-            (margin.margin for margin in each.margins.values()), default=0.0
-        )
+    def widest(one: Calibration) -> tuple[bool, int, float]:
+        return *nearness(one), max((m.margin for m in one.margins.values()), default=0.0)
 
-    for match, found in (("other", same), ("renumbered", renumbered)):
-        if found:
-            best = max(
-                reversed(found), key=nearness if found is same else widest
-            )  # of equals the first met, which is the latest
-            unlike = tuple(best.conditions.unlike(now))
-            exact = match == "other" and not unlike
-            margins = {name: each.margin for name, each in best.margins.items()}
-            return Chosen(margins, "exact" if exact else match, best, unlike)  # type: ignore[arg-type]
-    return NONE
+    if not same and not renumbered:
+        return NONE
+    # Of equals the first met: reversed, the latest.
+    best = max(reversed(same), key=nearness) if same else max(reversed(renumbered), key=widest)
+    unlike = tuple(best.preset.differences(preset))
+    match: Match = "renumbered" if not same else "other" if unlike else "exact"
+    return ChosenMargins({name: m.margin for name, m in best.margins.items()}, match, best, unlike)
 
 
 def calibrations_path(checkpoint: Path) -> Path:
@@ -185,7 +160,7 @@ def write_calibration(checkpoint: Path, found: Calibration) -> Path:
     """
 
     def replaced(each: Calibration) -> bool:
-        return each.content == found.content and not each.conditions.unlike(found.conditions)
+        return each.content == found.content and not each.preset.differences(found.preset)
 
     kept = [
         each
@@ -196,16 +171,15 @@ def write_calibration(checkpoint: Path, found: Calibration) -> Path:
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     content = CalibrationFile(calibrated=[*kept, found]).model_dump(mode="json")
     partial.write_text(
-        yaml.dump(content, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=132)
+        yaml.dump(content, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=100)
     )
     os.replace(partial, path)
     return path
 
 
-def _shown(conditions: Conditions, name: str) -> str:
-    value = getattr(conditions, name)
+def _shown(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{key}={each}" for key, each in value.items()) or "none"
+        return ", ".join(f"{key}={constant}" for key, constant in value.items()) or "none"
     if isinstance(value, tuple):
         return " ".join(value) or "none"
     return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

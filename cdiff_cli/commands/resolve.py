@@ -1,16 +1,15 @@
-"""From the options of a command to a resolved problem: recipe, preset, method, constraints, checkpoint, pins."""
+"""From a request to an experiment: names found, planner loaded, constraints compiled, ends checked."""
 
-import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.commands.margins import Chosen, Conditions, choose, read_calibrations
+from cdiff_cli.commands.experiment import Experiment, Request
+from cdiff_cli.commands.margins import ChosenMargins, choose_margins, read_calibrations
 from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of
 from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.kinds import DYNAMICS_TOLERANCE
@@ -20,434 +19,240 @@ from cdiff_cli.errors import CdiffError, CheckpointError, suggestion
 from cdiff_cli.evaluation.conformal import tightened
 from cdiff_cli.machine import choose_device
 from cdiff_cli.models.checkpoint import Checkpoint, load_checkpoint
-from cdiff_cli.models.denoiser import Denoiser, ObservingDenoiser, calls_a_step, guided
 from cdiff_cli.models.normaliser import Normaliser
-from cdiff_cli.models.recipe import Preset, Recipe, load_recipe
+from cdiff_cli.models.planner import Planner
+from cdiff_cli.models.preset import Preset
+from cdiff_cli.models.recipe import Recipe, load_recipe
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home, shown
 from cdiff_cli.planning.problem import Problem, check_feasible
 from cdiff_cli.planning.start_goal import parse_state, random_pairs
-from cdiff_cli.sampling.baselines import Conditional
 from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import METHODS, Unconstrained, make_method, settings_of
+from cdiff_cli.sampling.methods import METHODS, make_method, settings_of
 from cdiff_cli.sampling.sampler import Method
 from cdiff_cli.tasks import load_task
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import HasExactScore, HasRoutes, Task, observable_of
+
+WHOLE_PLAN_OPTIONS = ("start", "goal", "random", "no_dynamics")
+CONTROL_OPTIONS = ("execute", "warm", "margin", "action_noise", "env", "calibrate")
 
 
-@dataclass(frozen=True)
-class Request:
-    """What the user asked for; None is the task's own default."""
+def resolve(request: Request) -> Experiment:
+    """Everything that the request names, read and checked.
 
-    task: str = "maze2d-umaze"
-    method: str = "alm"
-    preset: str = "recommended"
-    constraints: Path | None = None
-    checkpoint: Path | None = None
-    recipe: str = "small"
-    start: str | None = None
-    goal: str | None = None
-    kernel: str | None = None
-    steps: int | None = None
-    extra_steps: int | None = None
-    settings: tuple[str, ...] = ()
-    n: int = 10
-    seed: int = 0
-    device: str = "auto"
-    random: bool = False
-    no_dynamics: bool = False
-    execute: int | None = None
-    warm: float | None = None
-    margin: float | None = None
-    action_noise: float = 0.0
-    env: tuple[str, ...] = ()
-    calibrate: bool = False
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """Everything a command needs, checked."""
-
-    options: Request
-    recipe: Recipe
-    preset: Preset
-    kernel: str
-    method: Method
-    settings: dict[str, Any]
-    problem: Problem
-    kinds: Sequence[Kind]
-    constraints_path: Path
-    checkpoint: Checkpoint | None
-    conditions: Conditions
-    margins: Chosen
-    conditional: Checkpoint | None = None
-
-    @property
-    def guided(self) -> Denoiser | None:
-        """The clean estimate of a conditional planner; None of the other methods."""
-        return None if self.conditional is None else self._guided(self.conditional, None)
-
-    @property
-    def seeing(self) -> ObservingDenoiser | None:
-        """The same of a planner that is told what it observes; None of the others."""
-        planner = self.conditional
-        if planner is None or (telling := planner.telling) is None:
-            return None
-        names, device = planner.card.observed, self.problem.device
-        return lambda seen, present: self._guided(
-            planner, telling([seen[name] for name in names], present).to(device)
-        )
-
-    def _guided(self, planner: Checkpoint, told: torch.Tensor | None) -> Denoiser:
-        return guided(planner.net, self.settings["weight"], planner.limit, told)
-
-    @property
-    def calls_a_step(self) -> int:
-        """Network calls of a diffusion step: two where the planner is asked with its condition and without."""
-        return calls_a_step(
-            self.conditions.returns if self.conditional is None else self.settings["weight"]
-        )
-
-    @property
-    def acts(self) -> bool:
-        """Whether the task is a control task, which plans anew at every step."""
-        return self.recipe.frame == "relative"
-
-    @property
-    def seeds(self) -> list[int]:
-        return list(range(self.options.seed, self.options.seed + self.options.n))
-
-    def row(self) -> dict[str, Any]:
-        """The columns that say what was run."""
-        return {
-            "task": self.options.task,
-            "constraints": self.constraints_path.stem,
-            "method": self.options.method,
-            "preset": self.options.preset + ("*" if self._changed() else ""),
-            "on": self.settings.get("on", ""),
-            "kernel": self.kernel,
-        }
-
-    def _changed(self) -> bool:
-        """Whether an option departs from the preset."""
-        asked = self.options
-        changed = (
-            asked.settings,
-            asked.kernel,
-            asked.steps,
-            asked.no_dynamics,
-            asked.execute,
-            asked.warm,
-            asked.action_noise,
-        )
-        return any(changed) or asked.extra_steps is not None or asked.margin is not None
-
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration, for run.yaml."""
-        options = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self.options).items()}
-        options["env"] = list(self.options.env)
-        card = self.checkpoint.card if self.checkpoint else None
-        pins = {name: None if s is None else s.tolist() for name, s in self._pins().items()}
-        return {
-            "options": options | {"settings": list(self.options.settings)},
-            "method": {self.options.method: self.settings},
-            "kernel": self.kernel,
-            "extra_steps": self.conditions.extra_steps,
-            "returns": self.conditions.returns,
-            "polish": self.preset.polish,
-            "safety": self.preset.safety,
-            "dynamics": bool(dynamics_of(self.problem.enforced)),
-            "margins": dict(self.margins.margins),
-            "margins_from": self.margins.told(),
-            "n_steps": self.problem.schedule.n_steps,
-            "horizon": self.problem.horizon,
-            **pins,
-            "constraints": {
-                "file": str(shown(self.constraints_path)),
-                "sha256": hashlib.sha256(self.constraints_path.read_bytes()).hexdigest(),
-                "content": [spec.model_dump(mode="json", exclude_none=True) for spec in self.kinds],  # type: ignore[attr-defined]
-            },
-            "checkpoint": None if card is None else card.model_dump(mode="json"),
-            "conditional": None
-            if self.conditional is None
-            else self.conditional.card.model_dump(mode="json"),
-        }
-
-    def _pins(self) -> dict[str, Array | None]:
-        return {"start": self.problem.start, "goal": self.problem.goal}
-
-    @property
-    def calibration_command(self) -> str:
-        """The command that fits margins to what was asked for."""
-        flags = {"settings": "--set", "steps": "--steps", "env": "--env"}
-        asked, default = asdict(self.options), asdict(Request())
-        words = [
-            "cdiff rollout --calibrate --level 0.99 --episodes 100 --seed 5000",
-            f"--task {self.options.task}",
-        ]
-        for name, value in asked.items():
-            if value != default[name] and name not in ("task", "n", "seed", "device", "calibrate"):
-                each = value if isinstance(value, tuple) else (value,)
-                words += [f"{flags.get(name, '--' + name.replace('_', '-'))} {one}" for one in each]
-        return " ".join(words)
-
-    @property
-    def note(self) -> str:
-        """One line where the margins were calibrated on something else than what was asked for, or not at all."""
-        return self.margins.note(
-            self.conditions, str(self.constraints_path), self.calibration_command
-        )
-
-
-def resolve(options: Request) -> Experiment:
-    """Read and check all that the options name; raises a CdiffError before anything is computed or written."""
-    task = load_task(options.task)
-    if options.n < 1:
-        raise CdiffError(f"--n: expected at least 1 plan, found {options.n}")
-    if (options.extra_steps or 0) < 0:
-        raise CdiffError(f"--extra-steps: expected 0 or more, found {options.extra_steps}")
-    if options.method not in METHODS:
-        make_method(options.method, {})
-    recipe = load_recipe(options.task)
-    if options.preset not in recipe.presets:
-        known = ", ".join(recipe.presets)
-        raise CdiffError(
-            f'no preset "{options.preset}"{suggestion(options.preset, recipe.presets)}; {task.name} has {known}'
-        )
-    _require_applicable(options, recipe.frame == "relative")
-    preset = recipe.presets[options.preset]
-    settings = {**preset.methods.get(options.method, {}), **parse_settings(options.settings)}
-    method = make_method(options.method, settings)
-    settings = settings_of(options.method, method)
-    kernel = options.kernel or preset.kernel
-    if kernel not in KERNELS:
-        raise CdiffError(
-            f'no kernel "{kernel}"{suggestion(kernel, KERNELS)}; choose from {", ".join(KERNELS)}'
-        )
-    path = options.constraints or shown(home() / "constraints" / recipe.constraints)
-    device = choose_device(options.device)
-    schedule = Schedule.cosine(recipe.n_steps)
-    if hasattr(task, "denoiser"):
-        checkpoint, returns, denoiser, normaliser = (
-            None,
-            0.0,
-            task.denoiser(schedule),
-            Normaliser.identity(len(task.layout)),
-        )
-        normaliser = Normaliser(normaliser.centre, normaliser.scale * task.scale)
-    else:
-        where = options.checkpoint or shown(
-            home() / "models" / task.name / f"{options.recipe}.safetensors"
-        )
-        checkpoint = load_checkpoint(where, task.name, device)
-        returns = recipe.returns if checkpoint.card.returns else 0.0
-        denoiser, normaliser = (
-            guided(checkpoint.net, returns, checkpoint.limit),
-            checkpoint.normaliser,
-        )
-        if (checkpoint.card.horizon, checkpoint.card.n_steps) != (recipe.horizon, recipe.n_steps):
-            schedule = Schedule.cosine(checkpoint.card.n_steps)
-    fitted, observable = (
-        checkpoint.dynamics if checkpoint else None,
-        getattr(task, "observable", ()),
-    )
-    kinds, g = load_constraints(
-        path, task.name, task.layout, fitted, observable, getattr(task, "dt", None)
-    )
-    limited = [part.name for part in g.parts if isinstance(part, RateLimit)]
-    if limited and recipe.frame == "relative":
-        raise CdiffError(
-            f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out'
-        )
-    steps = preset.steps if options.steps is None else options.steps
-    if steps is not None:
-        if not 1 <= steps <= schedule.n_steps:
-            source = f'preset "{options.preset}", steps' if options.steps is None else "--steps"
-            raise CdiffError(
-                f"{source}: expected 1 to {schedule.n_steps} (as trained), found {steps}"
-            )
-        schedule = schedule.respaced(steps)
-    start = parse_state("--start", options.start, recipe.start, task)
-    goal = parse_state("--goal", options.goal, recipe.goal, task)
-    horizon = checkpoint.card.horizon if checkpoint else recipe.horizon
-    if options.random:
-        if checkpoint is None or not hasattr(task, "random_point"):
-            raise CdiffError(f"--random: {task.name} has no start and goal to draw")
-        start, goal = random_pairs(task, g, checkpoint.card, options.n, options.seed)
-    obeyed = _obeyed(kinds, g, preset, task, None if options.no_dynamics else checkpoint)
-    returns = 0.0 if isinstance(method, Conditional) else returns  # it asks for something else
-    conditions = _conditions(options, preset, settings, kernel, schedule.n_steps, returns)
-    margins = _margins(options, preset, method, g, checkpoint, path, kinds, conditions)
+    Raises a CdiffError before anything is computed or written.
+    """
+    task, recipe = find(request)
+    loaded = load_planner(task, recipe, request)
+    preset, base, method = decide(request, recipe, loaded)
+    path, kinds, declared = compile_constraints(task, recipe, request, loaded)
+    start, goal = ends(request, recipe, task, declared, loaded.checkpoint)
+    margins = margins_for(request, preset, method, declared, loaded.checkpoint, path, kinds)
     problem = Problem(
-        task,
-        horizon,
-        denoiser,
-        schedule,
-        normaliser,
-        g,
-        tightened(obeyed, margins.margins),
-        start,
-        goal,
-        device,
+        planner=loaded.planner.respaced(preset.sampler.steps),
+        declared=declared,
+        enforced=tightened(
+            enforced_form(kinds, declared, preset, task, loaded.planner), margins.margins
+        ),
+        start=start,
+        goal=goal,
+        tolerances=task.tolerances,
     )
-    check_feasible(problem)
-    conditioned = _conditional(kinds, path, checkpoint) if isinstance(method, Conditional) else None
+    check_feasible(problem, task)
+    conditional = None
+    planner = problem.planner
+    if method.planner == "conditional":
+        conditional = load_conditional(kinds, path, loaded.checkpoint)
+        weight = preset.methods[request.method]["weight"]
+        planner = conditioned(planner, as_planner(conditional, task, weight))
     return Experiment(
-        options,
-        recipe,
-        preset,
-        kernel,
-        method,
-        settings,
-        problem,
-        kinds,
-        path,
-        checkpoint,
-        conditions,
-        margins,
-        conditioned,
+        request=request,
+        task=task,
+        recipe=recipe,
+        preset=preset,
+        changed=bool(preset.differences(base)) or request.margin is not None,
+        method=method,
+        problem=problem,
+        planner=planner,
+        kinds=kinds,
+        constraints_path=path,
+        margins=margins,
+        checkpoint=loaded.checkpoint,
+        conditional=conditional,
     )
 
 
-def _conditions(
-    options: Request,
-    preset: Preset,
-    settings: dict[str, Any],
-    kernel: str,
-    steps: int,
-    returns: float,
-) -> Conditions:
-    """How plans are made and followed, the options first, else the preset."""
-    extra = options.extra_steps
-    return Conditions(
-        method=options.method,
-        preset=options.preset,
-        settings=settings,
-        kernel=kernel,
-        steps=steps,
-        extra_steps=preset.extra_steps_for(options.method) if extra is None else extra,
-        temperature=preset.temperature,
-        polish=preset.polish,
-        execute=1 if options.execute is None else options.execute,
-        warm=options.warm,
-        action_noise=options.action_noise,
-        env=tuple(sorted(options.env)),
-        returns=returns,
-    )
+# 1. Names exist, options apply ---------------------------------------------------------------------
 
 
-def _margins(
-    options: Request,
-    preset: Preset,
-    method: Method,
-    g: Constraint,
-    checkpoint: Checkpoint | None,
-    path: Path,
-    kinds: Sequence[Kind],
-    conditions: Conditions,
-) -> Chosen:
-    """The margins asked for, else those calibrated on the nearest conditions."""
-    if options.margin is not None:
-        return Chosen({part.name: options.margin for part in g.parts}, "given")
-    if (
-        not preset.margin
-        or checkpoint is None
-        or options.calibrate
-        or isinstance(method, Unconstrained | Conditional)
-    ):
-        return Chosen({}, "unused")
-    known = read_calibrations(checkpoint.path)
-    return choose(known, checkpoint.card.weights_sha256, path.stem, kinds_sha256(kinds), conditions)
+def find(request: Request) -> tuple[Task, Recipe]:
+    """The task and its recipe; refuses unknown names and options that would be ignored."""
+    task = load_task(request.task)
+    if request.n < 1:
+        raise CdiffError(f"--n: expected at least 1 plan, found {request.n}")
+    if (request.extra_steps or 0) < 0:
+        raise CdiffError(f"--extra-steps: expected 0 or more, found {request.extra_steps}")
+    if request.method not in METHODS:
+        make_method(request.method, {})
+    recipe = load_recipe(request.task)
+    if request.preset not in recipe.presets:
+        known = ", ".join(recipe.presets)
+        near = suggestion(request.preset, recipe.presets)
+        raise CdiffError(f'no preset "{request.preset}"{near}; {task.name} has {known}')
+    if request.kernel is not None and request.kernel not in KERNELS:
+        near = suggestion(request.kernel, KERNELS)
+        raise CdiffError(f'no kernel "{request.kernel}"{near}; choose from {", ".join(KERNELS)}')
+    _refuse_ignored_options(request, task.control == "receding_horizon")
+    return task, recipe
 
 
-def _require_applicable(options: Request, acts: bool) -> None:
-    """Refuse options that would be ignored: those of whole plans on a control task, those of control on another."""
-    whole = ("start", "goal", "random", "no_dynamics")
-    control = ("execute", "warm", "margin", "action_noise", "env", "calibrate")
+def _refuse_ignored_options(request: Request, control: bool) -> None:
     default = Request()
-    for name in whole if acts else control:
-        if getattr(options, name) != getattr(default, name):
+    for name in WHOLE_PLAN_OPTIONS if control else CONTROL_OPTIONS:
+        if getattr(request, name) != getattr(default, name):
             flag = "--" + name.replace("_", "-")
-            why = (
-                "is for whole plans, and {} plans anew at every step"
-                if acts
-                else "is for control tasks, and {} is planned once"
-            )
-            raise CdiffError(f"{flag} {why.format(options.task)}; leave it out")
-    if options.calibrate and options.margin is not None:
+            why = f"is for control tasks, and {request.task} is planned once"
+            if control:
+                why = f"is for whole plans, and {request.task} plans anew at every step"
+            raise CdiffError(f"{flag} {why}; leave it out")
+    if request.calibrate and request.margin is not None:
         raise CdiffError("--margin: --calibrate acts without one; leave it out")
-    if not 0 <= (options.margin or 0) < math.inf:
+    if not 0 <= (request.margin or 0) < math.inf:
         raise CdiffError(
-            f"--margin: expected 0 or more, in the units of h, found {options.margin:g}"
+            f"--margin: expected 0 or more, in the units of h, found {request.margin:g}"
         )
-    if not 0 <= options.action_noise < math.inf:
-        raise CdiffError(f"--action-noise: expected 0 or more, found {options.action_noise:g}")
+    if not 0 <= request.action_noise < math.inf:
+        raise CdiffError(f"--action-noise: expected 0 or more, found {request.action_noise:g}")
+    if request.warm is not None and not 0 < request.warm <= 1:
+        raise CdiffError(
+            "--warm: expected a share of the diffusion steps above 0 and at most 1, "
+            f"found {request.warm:g}"
+        )
 
 
-def _conditional(kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None) -> Checkpoint:
+# 2. The planner: a checkpoint, or an exact score ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A planner with its trained schedule, and the checkpoint it is from; None for an exact score."""
+
+    planner: Planner
+    checkpoint: Checkpoint | None
+    return_weight: float
+
+
+def load_planner(task: Task, recipe: Recipe, request: Request) -> Loaded:
+    """The unconditional planner of the request."""
+    device = choose_device(request.device)
+    if isinstance(task, HasExactScore):
+        schedule, scale = Schedule.cosine(recipe.n_steps), task.scale
+        identity = Normaliser.identity(len(task.layout))
+        planner = Planner(
+            denoiser=task.denoiser(schedule),
+            schedule=schedule,
+            normaliser=Normaliser(identity.centre, identity.scale * scale),
+            horizon=recipe.horizon,
+            coordinates=task.layout,
+            dt=task.dt,
+            positions=task.positions,
+            device=device,
+        )
+        return Loaded(planner, None, 0.0)
+    default = home() / "models" / task.name / f"{request.recipe}.safetensors"
+    checkpoint = load_checkpoint(request.checkpoint or shown(default), task.name, device)
+    weight = recipe.returns if checkpoint.card.returns else 0.0
+    return Loaded(as_planner(checkpoint, task, weight), checkpoint, weight)
+
+
+def as_planner(checkpoint: Checkpoint, task: Task, weight: float) -> Planner:
+    """The planner of a task's checkpoint."""
+    return Planner.from_checkpoint(checkpoint, task.layout, task.dt, task.positions, weight)
+
+
+def conditioned(planner: Planner, conditional: Planner) -> Planner:
+    """The planner with the denoiser of one that was trained on from it for certain constraints."""
+    return replace(
+        planner,
+        denoiser=conditional.denoiser,
+        conditioned_denoiser=conditional.conditioned_denoiser,
+        calls_per_step=conditional.calls_per_step,
+    )
+
+
+def load_conditional(
+    kinds: Sequence[Kind], path: Path, checkpoint: Checkpoint | None
+) -> Checkpoint:
     """The planner that was trained for these constraints."""
     if checkpoint is None:
         raise CdiffError(
             "conditional: this task's score is exact, no planner can be trained for its constraints"
         )
-    task = checkpoint.card.task
-    where = shown(home() / "models" / task / f"conditional-{path.stem}.safetensors")
-    advice = f"train it with `cdiff train --task {task} --conditional {path}`"
+    card = checkpoint.card
+    where = shown(home() / "models" / card.task / f"conditional-{path.stem}.safetensors")
+    advice = f"train it with `cdiff train --task {card.task} --conditional {path}`"
     if not where.exists():
         raise CheckpointError(f"{where}: no conditional planner for these constraints; {advice}")
-    found = load_checkpoint(where, task, next(checkpoint.net.parameters()).device)
+    found = load_checkpoint(where, card.task, next(checkpoint.net.parameters()).device)
     if found.card.constraints != kinds_sha256(kinds):
         raise CheckpointError(
             f"{where}: trained for other constraints than {path} holds now; {advice} again"
         )
-    if (found.card.horizon, found.card.n_steps) != (
-        checkpoint.card.horizon,
-        checkpoint.card.n_steps,
-    ):
+    if (found.card.horizon, found.card.n_steps) != (card.horizon, card.n_steps):
         raise CheckpointError(
-            f"{where}: trained for another horizon or n_steps than {checkpoint.path}; {advice} again"
+            f"{where}: trained for another horizon or n_steps than {checkpoint.path}; "
+            f"{advice} again"
         )
     return found
 
 
-def _obeyed(
-    kinds: Sequence[Kind], g: Constraint, preset: Preset, task: Task, checkpoint: Checkpoint | None
-) -> Constraint:
-    """What sampling obeys: g, on segments where that is asked, and the checkpoint's dynamics where the preset asks for them."""
-    parts = enforced(kinds, g, preset.safety).parts
-    dynamics = checkpoint.dynamics if checkpoint else None
-    if preset.dynamics and dynamics is not None and not dynamics_of(g):
-        parts = (
-            *parts,
-            LinearDynamicsConstraint.from_dynamics("dynamics", dynamics, DYNAMICS_TOLERANCE),
+# 3. The preset and the method ----------------------------------------------------------------------
+
+
+def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Preset, Method]:
+    """The preset with the options applied, the recipe's own, and the method."""
+    own = recipe.presets[request.preset].of_method(request.method)
+    constants = own.methods[request.method]
+    method = make_method(request.method, {**constants, **parse_settings(request.settings)})
+    trained = loaded.planner.schedule.n_steps
+    steps = own.sampler.steps if request.steps is None else request.steps
+    if steps is not None and not 1 <= steps <= trained:
+        source = "--steps" if request.steps is not None else f'preset "{request.preset}", steps'
+        raise CdiffError(f"{source}: expected 1 to {trained} (as trained), found {steps}")
+    most = loaded.planner.horizon - 1
+    if request.execute is not None and not 1 <= request.execute <= most:
+        raise CdiffError(
+            f"--execute: expected 1 to {most} steps of a plan of {loaded.planner.horizon}, "
+            f"found {request.execute}"
         )
-    slow = task.tolerances.velocity_weight
-    weight = torch.tensor(
-        [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
+    resolved = own.updated(
+        {
+            "sampler.steps": own.sampler.steps or trained,
+            # A conditional planner is guided towards the constraints instead.
+            "sampler.return_weight": 0.0
+            if method.planner == "conditional"
+            else loaded.return_weight,
+            "control.env": tuple(sorted(request.env)),
+            "methods": {
+                request.method: settings_of(request.method, make_method(request.method, constants))
+            },
+        }
     )
-    parts = tuple(
-        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
-        for part in parts
+    options = {
+        "sampler.kernel": request.kernel,
+        "sampler.steps": steps,
+        "sampler.extra_steps": request.extra_steps,
+        "control.execute": request.execute,
+        "control.warm_start": request.warm,
+        "control.action_noise": request.action_noise,
+        "enforce.dynamics": False if request.no_dynamics else None,
+        "methods": {request.method: settings_of(request.method, method)},
+    }
+    return (
+        resolved.updated({name: value for name, value in options.items() if value is not None}),
+        resolved,
+        method,
     )
-    unchanged = len(parts) == len(g.parts) and all(
-        part is declared for part, declared in zip(parts, g.parts, strict=True)
-    )
-    return g if unchanged else Constraint(parts)
-
-
-def needed_speed(resolved: Experiment) -> tuple[float, float] | None:
-    """(mean speed the shortest way asks for, 95 % of the data's windows stay below), m/s; None where it has no meaning."""
-    problem, task = resolved.problem, resolved.problem.task
-    if (
-        problem.start is None
-        or problem.goal is None
-        or resolved.checkpoint is None
-        or resolved.options.random
-    ):
-        return None
-    columns = [task.layout.index(name) for name in task.positions]
-    length = cast(Any, task).path_length(problem.start[columns], problem.goal[columns])
-    return length / ((problem.horizon - 1) * task.dt), resolved.checkpoint.card.data["speed_q95"]
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, str]:
@@ -459,3 +264,111 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
             raise CdiffError(f"--set: expected name=value such as rho=0.05, found {text!r}")
         pairs[key.strip()] = value.strip()
     return pairs
+
+
+# 4. The constraints --------------------------------------------------------------------------------
+
+
+def compile_constraints(
+    task: Task, recipe: Recipe, request: Request, loaded: Loaded
+) -> tuple[Path, list[Kind], Constraint]:
+    """The constraint file, its kinds, and the g(x) <= 0 they declare."""
+    path = request.constraints or shown(home() / "constraints" / recipe.constraints)
+    observable = observable_of(task)
+    kinds, declared = load_constraints(
+        path,
+        task.name,
+        task.layout,
+        loaded.planner.dynamics,
+        observable,
+        task.dt,
+    )
+    limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
+    if limited and task.control == "receding_horizon":
+        raise CdiffError(
+            f'"{limited[0]}": `kind: rate` is for whole plans, '
+            f"and {task.name} plans anew at every step; leave it out"
+        )
+    return path, kinds, declared
+
+
+def enforced_form(
+    kinds: Sequence[Kind], declared: Constraint, preset: Preset, task: Task, planner: Planner
+) -> Constraint:
+    """What plans satisfy: g on segments where that is asked, and the planner's dynamics."""
+    parts = enforced(kinds, declared, preset.enforce.safety).parts
+    if preset.enforce.dynamics and planner.dynamics is not None and not dynamics_of(declared):
+        fitted = LinearDynamicsConstraint.from_dynamics(
+            "dynamics", planner.dynamics, DYNAMICS_TOLERANCE
+        )
+        parts = (*parts, fitted)
+    slow = task.tolerances.velocity_weight
+    weight = torch.tensor(
+        [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
+    )
+    parts = tuple(
+        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
+        for part in parts
+    )
+    same = len(parts) == len(declared.parts) and all(
+        part is one for part, one in zip(parts, declared.parts, strict=True)
+    )
+    return declared if same else Constraint(parts)
+
+
+def margins_for(
+    request: Request,
+    preset: Preset,
+    method: Method,
+    declared: Constraint,
+    checkpoint: Checkpoint | None,
+    path: Path,
+    kinds: Sequence[Kind],
+) -> ChosenMargins:
+    """The margins asked for, else those calibrated on the nearest preset."""
+    if request.margin is not None:
+        return ChosenMargins({part.name: request.margin for part in declared.parts}, "given")
+    wanted = preset.control.margins and not request.calibrate and method.enforces
+    if not wanted or checkpoint is None:
+        return ChosenMargins({}, "unused")
+    known = read_calibrations(checkpoint.path)
+    weights, content = checkpoint.card.weights_sha256, kinds_sha256(kinds)
+    return choose_margins(known, weights, path.stem, content, request.method, preset)
+
+
+# 5. Start and goal ---------------------------------------------------------------------------------
+
+
+def ends(
+    request: Request,
+    recipe: Recipe,
+    task: Task,
+    declared: Constraint,
+    checkpoint: Checkpoint | None,
+) -> tuple[Array | None, Array | None]:
+    """The start and goal, parsed or drawn."""
+    if request.random:
+        if checkpoint is None or not isinstance(task, HasRoutes):
+            raise CdiffError(f"--random: {task.name} has no start and goal to draw")
+        return random_pairs(task, declared, checkpoint.card, request.n, request.seed)
+    return (
+        parse_state("--start", request.start, recipe.start, task),
+        parse_state("--goal", request.goal, recipe.goal, task),
+    )
+
+
+def needed_speed(experiment: Experiment) -> tuple[float, float] | None:
+    """Mean speed that the shortest way asks for, and the 95 % quantile of the data's windows.
+
+    In m/s; None where they have no meaning.
+    """
+    problem, task, checkpoint = experiment.problem, experiment.task, experiment.checkpoint
+    if problem.start is None or problem.goal is None:
+        return None
+    if checkpoint is None or experiment.request.random:
+        return None
+    if not isinstance(task, HasRoutes):
+        return None
+    columns = problem.planner.position_columns
+    length = task.path_length(problem.start[columns], problem.goal[columns])
+    return length / ((problem.planner.horizon - 1) * task.dt), checkpoint.card.data["speed_q95"]

@@ -1,26 +1,28 @@
-"""`cdiff rollout`: plan, act, measure, and leave a run directory behind."""
+"""`cdiff rollout`: plan, act, measure, and leave a run directory behind.
 
-import platform
-import sys
-from collections.abc import Mapping
+Whole plans are followed by a tracking controller; control tasks plan anew at every step.
+"""
+
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from cdiff_cli import machine
+from cdiff_cli.arrays import Array
+from cdiff_cli.commands.experiment import Experiment
 from cdiff_cli.commands.plan import (
+    PACKAGES,
     Finished,
     Tick,
-    _name,
-    _plan_both,
-    _plan_pictures,
-    _plan_rows,
-    _write_certificate,
-    _write_plans,
+    plan_both,
+    plan_pictures,
+    plan_rows,
+    run_name,
+    write_certificate,
+    write_plans,
 )
-from cdiff_cli.commands.resolve import Experiment
 from cdiff_cli.commands.run_directory import new_run, write_rows, write_yaml
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.evaluation import metrics
@@ -28,195 +30,16 @@ from cdiff_cli.evaluation.certificate import summary
 from cdiff_cli.evaluation.columns import Row
 from cdiff_cli.evaluation.figures import episodes as episode_figures
 from cdiff_cli.evaluation.figures import plans as plan_figures
-from cdiff_cli.machine import device_name, git_commit
 from cdiff_cli.planning.episodes import Episodes
 from cdiff_cli.planning.execution import Rollout, follow
-from cdiff_cli.planning.receding_horizon import Controller, control
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.methods import Unconstrained
-from cdiff_cli.tasks.protocol import ControlTask
+from cdiff_cli.planning.receding_horizon import Controller, rollout
+from cdiff_cli.tasks.protocol import Brakes, ControlTask, HasEnvOptions, Task, Tracks
 
-
-def control_run(
-    resolved: Experiment,
-    root: Path,
-    tick: Tick,
-    video: str | None = None,
-    *,
-    name: str | None = None,
-    pictures: bool = True,
-) -> Finished:
-    """Act for an episode a seed, replanning as the preset says; measure; write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
-    acting, options = controller(resolved), resolved.options
-    env_options = parse_env(acting.task, options.env)
-    with new_run(root, name or f"rollout-{options.task}-{options.method}-{options.preset}") as run:
-        recorder = (
-            episode_figures.Recorder(run.path / f"rollout.{video}", acting.task, acting.g)
-            if video
-            else None
-        )
-        env = env_options | ({"render": True} if video else {})
-        done = control(
-            acting,
-            resolved.seeds,
-            env,
-            on_step=lambda k, n: tick("control", k, n),
-            on_frame=recorder,
-        )
-        levels = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
-        rows = _rows(resolved, acting, done, levels)
-        _write(run.path, resolved, acting, done, rows)
-        title = f"{options.task}, {options.method} ({options.preset}), n = {len(rows)}"
-        if pictures:
-            episode_figures.levels_picture(
-                run.path / "rollout.png", acting.task, acting.g, done, levels, title
-            )
-        if recorder:
-            recorder.write(done, levels)
-    warning = (
-        f"{_diverged(done)}; what they had done until then is kept" if done.diverged.any() else ""
-    )
-    counts = {
-        "episodes": len(rows),
-        "safe_executed": int(sum(row["safe_executed"] for row in rows)),
-    }
-    verdict = f"executed     {counts['safe_executed']} of {len(rows)} episodes safe at every step"
-    notes = (resolved.note,) if resolved.note else ()
-    return Finished(
-        run.path,
-        rows,
-        run.path / "rollout.png",
-        cast(Any, counts),
-        verdict,
-        notes=notes,
-        warning=warning,
-    )
-
-
-def _diverged(done: Episodes) -> str:
-    return f"{int(done.diverged.sum())} of {len(done.x)} episodes diverged (a plan or a state was no longer finite) and were stopped"
-
-
-def controller(resolved: Experiment) -> Controller:
-    """What acting needs."""
-    problem, preset, options, checkpoint = (
-        resolved.problem,
-        resolved.preset,
-        resolved.options,
-        resolved.checkpoint,
-    )
-    if checkpoint is None or checkpoint.frame is None or checkpoint.inverse is None:
-        raise CdiffError(
-            f"{problem.task.name}: the checkpoint holds no inverse dynamics; train it with this version of cdiff"
-        )
-    execute, warm = resolved.conditions.execute, resolved.conditions.warm
-    inverse = resolved.recipe.train[checkpoint.card.recipe].inverse
-    ahead = 1 if inverse is None else inverse.ahead
-    if not 1 <= execute <= problem.horizon - ahead:
-        raise CdiffError(
-            f"--execute: expected 1 to {problem.horizon - ahead} steps of a plan of {problem.horizon}, found {execute}"
-        )
-    if warm is not None and not 0 < warm <= 1:
-        raise CdiffError(
-            f"--warm: expected a share of the diffusion steps above 0 and at most 1, found {warm:g}"
-        )
-    return Controller(
-        task=cast(ControlTask, problem.task),
-        denoiser=resolved.guided or problem.denoiser,
-        seeing=resolved.seeing,
-        calls_a_step=resolved.calls_a_step,
-        schedule=problem.schedule,
-        frame=checkpoint.frame,
-        inverse=checkpoint.inverse,
-        g=problem.g,
-        enforced=problem.enforced,
-        method=resolved.method,
-        device=problem.device,
-        kernel=resolved.kernel,
-        extra_steps=resolved.conditions.extra_steps,
-        polish=preset.polish and not isinstance(resolved.method, Unconstrained | BestOf),
-        temperature=preset.temperature,
-        ahead=ahead,
-        execute=execute,
-        warm=warm,
-        resume=preset.resume,
-        brake=getattr(problem.task, "brake", None),
-        action_noise=options.action_noise,
-    )
-
-
-def parse_env(task: ControlTask, pairs: tuple[str, ...]) -> dict[str, Any]:
-    """["pattern=chaser"] as options of the task's environment; CdiffError where it has no such option or value."""
-    known: Mapping[str, tuple[Any, ...]] = getattr(task, "env_options", {})
-    found = {}
-    for pair in pairs:
-        name, equals, text = pair.partition("=")
-        if not equals and name in known:
-            raise CdiffError(
-                f'--env: expected name=value such as {name}={next(iter(known[name]))}, found "{pair}"'
-            )
-        if name in found:
-            raise CdiffError(f"--env {name}: given twice; it has one value an episode")
-        if name not in known:
-            has = ", ".join(known) or "none"
-            raise CdiffError(
-                f'--env: {task.name} has no option "{name}"{suggestion(name, known)}; its options are: {has}'
-            )
-        values = {str(value).lower(): value for value in known[name]}
-        if text.lower() not in values:
-            raise CdiffError(
-                f'--env {name}: expected one of {", ".join(values)}, found "{text}"{suggestion(text, values)}'
-            )
-        found[name] = values[text.lower()]
-    return found
-
-
-def _rows(resolved: Experiment, acting: Controller, done: Episodes, levels: Any) -> list[Row]:
-    space = acting.task.make_env().action_space
-    measured = metrics.control_metrics(
-        done, levels, (space.low.astype(float), space.high.astype(float))
-    )
-    told = resolved.row()
-    told["constraints"] = " ".join(
-        (told["constraints"], *resolved.options.env)
-    )  # what was met is part of what was asked
-    return [
-        told | {"seed": seed} | values
-        for seed, values in zip(resolved.seeds, measured, strict=True)
-    ]
-
-
-def _write(
-    path: Path, resolved: Experiment, acting: Controller, done: Episodes, rows: list[Row]
-) -> None:
-    about = {
-        "command": ["cdiff", *sys.argv[1:]],
-        "commit": git_commit(),
-        "versions": {
-            name: version(name) for name in ("torch", "numpy", "mujoco", "gymnasium", "pybullet")
-        },
-        "python": platform.python_version(),
-        "device": device_name(acting.device),
-        "wall_s": round(float(done.latency_s.sum()), 3),
-        "execute": acting.execute,
-        "warm": acting.warm,
-        "temperature": acting.temperature,
-    }
-    write_yaml(path / "run.yaml", about | resolved.config())
-    arrays: dict[str, Any] = {
-        name: value for name, value in asdict(done).items() if name not in ("observed", "info")
-    }
-    arrays |= done.observed | {f"info.{name}": value for name, value in done.info.items()}
-    layout: Any = {
-        "layout": np.array(acting.task.layout),
-        "parts": np.array([part.name for part in acting.g.parts]),
-    }
-    np.savez_compressed(path / "rollout.npz", **arrays, **layout, seed=np.array(resolved.seeds))
-    write_rows(path / "rows.csv", rows)
+# Whole plans ---------------------------------------------------------------------------------------
 
 
 def rollout_run(
-    resolved: Experiment,
+    experiment: Experiment,
     root: Path,
     tick: Tick,
     video: str | None = None,
@@ -225,43 +48,192 @@ def rollout_run(
     name: str | None = None,
     pictures: bool = True,
 ) -> Finished:
-    """Plan, follow each plan in its environment, measure both, write runs/<stamp>-rollout-.../, or <stamp>-<name>"""
-    task = resolved.problem.task
-    if not hasattr(task, "track"):
+    """Plan, follow each plan in its environment, measure both.
+
+    Writes runs/<stamp>-rollout-TASK-METHOD-PRESET/, or <stamp>-<name>/.
+
+    hold   steps at the last waypoint after the plan's end
+    """
+    task, g = experiment.task, experiment.declared
+    if not isinstance(task, Tracks):
         raise CdiffError(
-            f"{task.name} has no environment to roll out in; plan it with `cdiff plan --task {task.name}`"
+            f"{task.name} has no environment to roll out in; "
+            f"plan it with `cdiff plan --task {task.name}`"
         )
-    plans, free = _plan_both(resolved, tick)
+    plans, free = plan_both(experiment, tick)
     n = len(plans.x)
-    done = follow(task, plans.x, resolved.seeds, hold, lambda k: tick("roll out", k, n), plans.u)
-    measured = metrics.rollout_metrics(
-        resolved.problem.g, done.x, done.reward, done.success, done.goal_distance
+    executed = follow(
+        task, plans.x, experiment.seeds, hold, lambda k: tick("roll out", k, n), plans.u
     )
-    rows = [
-        row | more for row, more in zip(_plan_rows(resolved, plans, free), measured, strict=True)
-    ]
-    with new_run(root, name or _name("rollout", resolved)) as run:
-        _write_plans(run.path, resolved, plans, free, rows)
-        _write_rollout(run.path, resolved, done)
-        counts = _write_certificate(run.path, resolved, plans.x, done.x)
+    measured = metrics.rollout_metrics(
+        g, executed.x, executed.reward, executed.success, executed.goal_distance
+    )
+    planned = plan_rows(experiment, plans, free)
+    rows = [row | more for row, more in zip(planned, measured, strict=True)]
+    with new_run(root, name or run_name("rollout", experiment)) as run:
+        write_plans(run.path, experiment, plans, free, rows)
+        _write_executed(run.path, experiment, executed)
+        counts = write_certificate(run.path, experiment, plans.x, executed.x)
         if pictures:
-            _plan_pictures(run.path, resolved, plans, free)
-            title = f"{task.name}, {resolved.options.method}: executed over planned"
+            plan_pictures(run.path, experiment, plans, free)
+            title = f"{task.name}, {experiment.request.method}: executed over planned"
             plan_figures.plan_picture(
-                run.path / "rollout.png", task, resolved.problem.g, done.x, plans.x, title
+                run.path / "rollout.png", experiment.task, g, executed.x, plans.x, title
             )
         if video:
             tick("video", 0, 1)
-            plan_figures.rollout_video(
-                run.path / f"rollout.{video}", task, resolved.problem.g, done.x, plans.x
-            )
+            file = run.path / f"rollout.{video}"
+            plan_figures.rollout_video(file, experiment.task, g, executed.x, plans.x)
             tick("video", 1, 1)
+    verdict = f"certificate  {summary(counts)}"
+    return Finished(run.path, rows, run.path / "rollout.png", counts, verdict)
+
+
+def _write_executed(path: Path, experiment: Experiment, executed: Rollout) -> None:
+    layout, seeds = np.array(experiment.task.layout), np.array(experiment.seeds)
+    arrays: Any = asdict(executed) | {"layout": layout, "seed": seeds}
+    np.savez_compressed(path / "rollout.npz", **arrays)
+
+
+# Control tasks -------------------------------------------------------------------------------------
+
+
+def control_run(
+    experiment: Experiment,
+    root: Path,
+    tick: Tick,
+    video: str | None = None,
+    *,
+    name: str | None = None,
+    pictures: bool = True,
+) -> Finished:
+    """Act for one episode per seed, planning anew as the preset says; measure.
+
+    Writes runs/<stamp>-rollout-TASK-METHOD-PRESET/, or <stamp>-<name>/.
+    """
+    acting, request = controller(experiment), experiment.request
+    task, g = cast(ControlTask, experiment.task), experiment.declared
+    env = parse_env(task, request.env) | ({"render": True} if video else {})
+    with new_run(root, name or run_name("rollout", experiment)) as run:
+        recorder = None
+        if video:
+            recorder = episode_figures.Recorder(run.path / f"rollout.{video}", task, g)
+        done = rollout(
+            acting,
+            task,
+            experiment.seeds,
+            env,
+            on_step=lambda k, n: tick("control", k, n),
+            on_frame=recorder,
+        )
+        levels = metrics.executed_levels(g, done.x, done.observed, task.dt)
+        rows = _control_rows(experiment, done, levels)
+        _write_episodes(run.path, experiment, done, rows)
+        if pictures:
+            title = f"{request.task}, {request.method} ({request.preset}), n = {len(rows)}"
+            episode_figures.levels_picture(run.path / "rollout.png", task, g, done, levels, title)
+        if recorder:
+            recorder.write(done, levels)
+    warning = (
+        f"{diverged_text(done)}; what they did until then is kept" if done.diverged.any() else ""
+    )
+    safe = int(sum(row["safe_executed"] for row in rows))
     return Finished(
-        run.path, rows, run.path / "rollout.png", counts, f"certificate  {summary(counts)}"
+        run.path,
+        rows,
+        run.path / "rollout.png",
+        {"episodes": len(rows), "safe_executed": safe},
+        f"executed     {safe} of {len(rows)} episodes safe at every step",
+        notes=(experiment.note,) if experiment.note else (),
+        warning=warning,
     )
 
 
-def _write_rollout(path: Path, resolved: Experiment, done: Rollout) -> None:
-    layout = np.array(resolved.problem.task.layout)
-    arrays: Any = asdict(done) | {"layout": layout, "seed": np.array(resolved.seeds)}
-    np.savez_compressed(path / "rollout.npz", **arrays)
+def diverged_text(done: Episodes) -> str:
+    """How many episodes diverged."""
+    return (
+        f"{int(done.diverged.sum())} of {len(done.x)} episodes diverged "
+        "(a plan or a state was no longer finite) and were stopped"
+    )
+
+
+def controller(experiment: Experiment) -> Controller:
+    """The controller of a control task."""
+    task, checkpoint = experiment.task, experiment.checkpoint
+    if checkpoint is None or experiment.planner.inverse_dynamics is None:
+        raise CdiffError(
+            f"{task.name}: the checkpoint holds no inverse dynamics; "
+            "train it with this version of cdiff"
+        )
+    trained = experiment.recipe.train[checkpoint.card.recipe].inverse
+    return Controller(
+        planner=experiment.planner,
+        declared=experiment.declared,
+        method=experiment.method,
+        enforced=experiment.problem.enforced,
+        sampler=experiment.preset.sampler,
+        control=experiment.preset.control,
+        fallback_action=task.brake if isinstance(task, Brakes) else None,
+        ahead=1 if trained is None else trained.ahead,
+    )
+
+
+def parse_env(task: Task, pairs: tuple[str, ...]) -> dict[str, Any]:
+    """["pattern=chaser"] as options of the task's environment.
+
+    Raises CdiffError where the task has no such option or value.
+    """
+    known = task.env_options if isinstance(task, HasEnvOptions) else {}
+    options = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals and name in known:
+            example = f"{name}={next(iter(known[name]))}"
+            raise CdiffError(f'--env: expected name=value such as {example}, found "{pair}"')
+        if name in options:
+            raise CdiffError(f"--env {name}: given twice; it has one value per episode")
+        if name not in known:
+            has = ", ".join(known) or "none"
+            raise CdiffError(
+                f'--env: {task.name} has no option "{name}"{suggestion(name, known)}; '
+                f"its options are: {has}"
+            )
+        values = {str(value).lower(): value for value in known[name]}
+        if text.lower() not in values:
+            raise CdiffError(
+                f"--env {name}: expected one of {', '.join(values)}, "
+                f'found "{text}"{suggestion(text, values)}'
+            )
+        options[name] = values[text.lower()]
+    return options
+
+
+def _control_rows(experiment: Experiment, done: Episodes, levels: Array) -> list[Row]:
+    """One row of rows.csv per episode."""
+    space = experiment.task.make_env().action_space
+    bounds = (space.low.astype(float), space.high.astype(float))
+    measured = metrics.control_metrics(done, levels, bounds)
+    row = experiment.row()
+    # The obstacle that was met is part of what was asked.
+    row["constraints"] = " ".join((row["constraints"], *experiment.request.env))
+    return [
+        row | {"seed": seed} | values
+        for seed, values in zip(experiment.seeds, measured, strict=True)
+    ]
+
+
+def _write_episodes(path: Path, experiment: Experiment, done: Episodes, rows: list[Row]) -> None:
+    """run.yaml, rollout.npz and rows.csv."""
+    packages = (*PACKAGES, "pybullet")
+    record = machine.record(
+        experiment.problem.planner.device, float(done.latency_s.sum()), packages
+    )
+    write_yaml(path / "run.yaml", record | experiment.record())
+    arrays: dict[str, Any] = {
+        name: value for name, value in asdict(done).items() if name not in ("observed", "info")
+    }
+    arrays |= done.observed | {f"info.{name}": value for name, value in done.info.items()}
+    arrays["layout"] = np.array(experiment.task.layout)
+    arrays["parts"] = np.array([part.name for part in experiment.declared.parts])
+    np.savez_compressed(path / "rollout.npz", **arrays, seed=np.array(experiment.seeds))
+    write_rows(path / "rows.csv", rows)

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.run_directory import find_rows, read_rows
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.evaluation.columns import Row
@@ -122,7 +123,7 @@ def _jobs(
     group = (task, stem, method, preset)
     digest, error = "", None
     try:
-        config = resolve(asked).config()
+        config = resolve(asked).record()
         decides = {
             key: value for key, value in config.items() if key not in ("options", "start", "goal")
         }
@@ -193,7 +194,7 @@ def run_job(job: Job, root: Path, folder: Path) -> Outcome:
     try:
         with contextlib.chdir(folder), _one_thread():
             resolved = resolve(job.options)
-            execute = control_run if resolved.recipe.frame == "relative" else rollout_run
+            execute = control_run if resolved.task.control == "receding_horizon" else rollout_run
             make = cast(Any, execute if job.rollout else plan_run)
             finished = make(resolved, root, lambda *_: None, name=job.name, pictures=False)
         return Outcome(job, time.perf_counter() - began, diverged=_diverged(finished.rows))

@@ -41,6 +41,13 @@ class Pins:
     def none(cls, like: Traj) -> "Pins":
         return cls(torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device), like)
 
+    @classmethod
+    def ends(cls, x: Traj) -> "Pins":
+        """The first and the last state of each trajectory are fixed at their values in x."""
+        mask = torch.zeros(x.shape[1:], dtype=torch.bool, device=x.device)
+        mask[[0, -1]] = True
+        return cls(mask, x)
+
     def paint(self, x: Traj) -> Traj:
         """x with the pinned coordinates set."""
         return torch.where(self.mask, self.values.to(x), x)

@@ -156,6 +156,19 @@ class Constraint:
             else x.new_empty((*x.shape[:2], 0))
         )
 
+    def worst(self, x: Traj) -> Float[Tensor, "batch"]:  # noqa: F821
+        """The largest g of each trajectory, at its waypoints and between them; -inf where g has no rows.
+
+        Between waypoints a barrier counts by its value -h, and a black box by its rows alone.
+        """
+        rows = [values for part in self.parts for values in (part(x), part.segment_max(x))]
+        lowest = x.new_full((len(x), 1), -torch.inf)
+        return torch.cat([lowest, *rows], 1).amax(1)
+
+    def on_segments(self) -> "Constraint":
+        """The constraint that holds all along the segments, as far as the form of each part allows."""
+        return Constraint(tuple(part for whole in self.parts for part in whole.on_segments()))
+
     def condense(self, horizon: int, dim: int) -> AffineRows | None:
         """The rows as one matrix, float64, from their values and pulls at 0; None where a part is not affine.
 

@@ -17,7 +17,7 @@ from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.planning.episodes import Episodes
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import Task, walls_of
 
 SAFE = 1e-6  # largest g that counts as safe in shares: rounding of float32; certificates allow none
 SMOOTH = 1.2  # largest jump of a smooth plan, over the 99.9 % quantile of the data
@@ -169,7 +169,7 @@ def plan_metrics(
     """
     positions = [task.layout.index(name) for name in task.positions]
     velocities = [task.layout.index(name) for name in task.velocities]
-    walls = task.walls()
+    walls = walls_of(task)
     total, worst, between = violation(g, x), worst_waypoint(g, x), worst_segment(g, x)
     measured: dict[str, Any] = {
         "violation": total,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from cdiff_cli.arrays import Array
@@ -40,6 +41,23 @@ class Normaliser:
     @classmethod
     def identity(cls, dim: int) -> "Normaliser":
         return cls(torch.zeros(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
+
+    @classmethod
+    def from_limits(cls, low: ArrayLike, high: ArrayLike) -> "Normaliser":
+        """[low, high] of each coordinate to [-1, 1]   [dim], environment units
+
+        Raises ValueError where a coordinate has no width.
+        """
+        bottom, top = (torch.as_tensor(np.asarray(v, dtype=np.float64)) for v in (low, high))
+        if bottom.shape != top.shape or bottom.ndim != 1 or not bool((bottom < top).all()):
+            raise ValueError(
+                f"expected low < high for every coordinate, found {low!r} and {high!r}"
+            )
+        return cls((bottom + top) / 2, (top - bottom) / 2)
+
+    def at(self, present: Tensor) -> "Normaliser":
+        """The same map for windows from any present state, as ResidualNormaliser.at."""
+        return Normaliser(self.centre[None, None], self.scale[None])
 
     def encode(self, x: Tensor) -> Tensor:
         return (x - self.centre.to(x)) / self.scale.to(x)

@@ -1,14 +1,13 @@
 """Recipes and cards: how a task's model is trained and sampled, and what a trained checkpoint says of itself."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from cdiff_cli.models.preset import Count, Positive, Preset
 from cdiff_cli.paths import home, shown
 from cdiff_cli.yaml_files import Strict, load
-
-Positive = Annotated[int, Field(gt=0)]
-Count = Annotated[int, Field(ge=0)]
 
 
 class NetworkSpec(Strict):
@@ -105,36 +104,6 @@ class PaperUnits(Strict):
     distance_power: float = 1.0
 
 
-class Preset(Strict):
-    """How to sample.
-
-    steps       network calls to respace the schedule to; None: as trained
-    extra_steps further steps with t frozen and no noise; extra_steps_of: the number of a method that has its own
-    polish      project the finished plans once more, in float64
-    safety      where constraints hold that do not say so themselves
-    dynamics    obey the checkpoint's linear dynamics too
-    temperature factor on all noise
-    resume      in control, begin each plan from the multipliers that the last one ended with
-    margin      in control, tighten the constraints by the margins that `cdiff rollout --calibrate` wrote
-    methods     each method's constants by its name
-    """
-
-    kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
-    steps: Positive | None = None
-    extra_steps: Count = 0
-    extra_steps_of: dict[str, Count] = {}
-    polish: bool = False
-    safety: Literal["waypoints", "segments"] = "waypoints"
-    dynamics: bool = False
-    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
-    resume: bool = False
-    margin: bool = False
-    methods: dict[str, dict[str, Any]] = {}
-
-    def extra_steps_for(self, method: str) -> int:
-        return self.extra_steps_of.get(method, self.extra_steps)
-
-
 class Recipe(Strict):
     """models/<task>/recipe.yaml
 
@@ -170,14 +139,46 @@ class Recipe(Strict):
                 )
         return self
 
+    @field_validator("presets", mode="before")
+    @classmethod
+    def _presets_begin_like_others(cls, presets: Any) -> Any:
+        """`like: NAME` fills a preset with what it does not say itself from a preset above it."""
+        if not isinstance(presets, dict):
+            return presets
+        whole: dict[str, Any] = {}
+        for name, preset in presets.items():
+            values = dict(preset) if isinstance(preset, dict) else preset
+            if isinstance(values, dict) and "like" in values:
+                base = values.pop("like")
+                if base not in whole:
+                    raise ValueError(
+                        f"{name}.like: expected a preset above it, found {base!r}; "
+                        f"above it are: {', '.join(whole) or 'none'}"
+                    )
+                values = merged(whole[base], values)
+            whole[name] = values
+        return whole
+
     @model_validator(mode="after")
     def _presets_fit(self) -> "Recipe":
         for name, preset in self.presets.items():
-            if preset.steps is not None and preset.steps > self.n_steps:
+            steps = preset.sampler.steps
+            if steps is not None and steps > self.n_steps:
                 raise ValueError(
-                    f"presets.{name}.steps: expected 1 to {self.n_steps} (n_steps), found {preset.steps}"
+                    f"presets.{name}.sampler.steps: "
+                    f"expected 1 to {self.n_steps} (n_steps), found {steps}"
                 )
         return self
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the entries of `over` in their place, nested mappings entry by entry."""
+    values = dict(base)
+    for name, value in over.items():
+        below = values.get(name)
+        nested = isinstance(below, dict) and isinstance(value, dict)
+        values[name] = merged(dict(below or {}), value) if nested else value
+    return values
 
 
 class Card(Strict):

@@ -1,8 +1,9 @@
 """The noise schedule of a diffusion model."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,18 @@ class Schedule:
         for now, before in zip(level[1:], level[:-1], strict=True):
             alpha_bar.append(alpha_bar[-1] * (1 - min(1 - now / before, 0.999)))
         return cls(tuple(alpha_bar), tuple(range(n_steps + 1)))
+
+    @classmethod
+    def from_alphas_cumprod(cls, alphas_cumprod: Sequence[float]) -> "Schedule":
+        """The schedule with these alpha_bar at the steps 1 to n.
+
+        Raises ValueError unless they fall and lie between 0 and 1.
+        """
+        levels = [float(level) for level in alphas_cumprod]
+        falling = all(after < before for before, after in pairwise([1.0, *levels]))
+        if not levels or not falling or levels[-1] <= 0:
+            raise ValueError("alphas_cumprod: expected numbers that fall from below 1 to above 0")
+        return cls((1.0, *levels), tuple(range(len(levels) + 1)))
 
     @property
     def n_steps(self) -> int:

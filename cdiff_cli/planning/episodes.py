@@ -1,40 +1,45 @@
-"""Closed-loop episodes: what was executed, what the plans had foreseen, and the log that they grow from."""
+"""Closed-loop episodes: what was executed, what the plans predicted, and the log they grow from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.tasks.protocol import ControlTask
+from cdiff_cli.planning.replanning import Plan
+from cdiff_cli.tasks.protocol import ControlTask, observable_of
 
 
 @dataclass(frozen=True)
 class Episodes:
     """Executed episodes; entries after an episode's end are NaN.
 
-    x           states [n, steps + 1, dim];  u inputs [n, steps, m];  reward [n, steps]
-    planned     the state that the plan followed foresaw for each state [n, steps + 1, dim]; the first is the start itself
-    foreseen    value of each part's level at `planned`, on what was observed when it was planned [n, steps + 1, parts]
-    observed    observed quantities by name, each [n, steps + 1]
-    violation   sum over waypoints and rows of [g]_+ of each plan, as declared [n, steps], NaN where none was made
-    calls       network calls of each plan [n, steps], NaN where none was made
-    braked      1 where the input was the task's brake, for want of a plan that obeys the constraints [n, steps]
-    info        numbers that the environment told beside the reward, by name, each [n, steps]
-    fell        whether the episode was ended by the environment [n]
-    diverged    whether it was ended because its plan or its state was no longer finite [n]
-    latency_s   wall time of each control step at which plans were made, of all episodes at once; network_s the network's part
+    x                 executed states [n, steps + 1, dim]
+    u                 inputs as applied [n, steps, m]
+    reward            [n, steps]
+    predicted         the state that the plan followed predicted for each step [n, steps + 1, dim];
+                      the first is the start itself
+    predicted_levels  each constraint's value at `predicted`, with what was observed when the plan
+                      was made [n, steps + 1, constraints]
+    observed          observed quantities by name, each [n, steps + 1]
+    violation         sum over waypoints and rows of [g]_+ per plan, as declared [n, steps]; NaN
+                      where none was made
+    calls             network calls per plan [n, steps]; NaN where none was made
+    braked            1 where the input was the fallback action [n, steps]
+    info              numbers that the environment reports beside the reward, by name, each [n, steps]
+    fell              whether the environment ended the episode [n]
+    diverged          whether it ended because its plan or state was not finite [n]
+    latency_s         wall time per planning step, for all episodes together
+    network_s         the network's part of it
     """
 
     x: Array
     u: Array
     reward: Array
-    planned: Array
-    foreseen: Array
+    predicted: Array
+    predicted_levels: Array
     observed: dict[str, Array]
     violation: Array
     calls: Array
@@ -51,10 +56,10 @@ class Log:
 
     def __init__(self, task: ControlTask, parts: int, n: int, steps: int) -> None:
         dim, inputs, self.done = len(task.layout), len(task.actions), 0
-        self.x, self.planned = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
+        self.x, self.predicted = (np.full((n, steps + 1, dim), np.nan) for _ in range(2))
         self.u, self.reward = np.full((n, steps, inputs), np.nan), np.full((n, steps), np.nan)
-        self.foreseen = np.full((n, steps + 1, parts), np.nan)
-        self.observed = {name: np.full((n, steps + 1), np.nan) for name in task.observable}
+        self.predicted_levels = np.full((n, steps + 1, parts), np.nan)
+        self.observed = {name: np.full((n, steps + 1), np.nan) for name in observable_of(task)}
         self.violation, self.calls = (np.full((n, steps), np.nan) for _ in range(2))
         self.braked = np.zeros((n, steps))
         self.fell, self.diverged = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
@@ -74,27 +79,16 @@ class Log:
     ) -> None:
         self.x[which, tau] = states
         if tau == 0:
-            self.planned[which, 0] = states
+            self.predicted[which, 0] = states
         for name, values in self.observed.items():
             values[which, tau] = [each[name] for each in observed]
 
-    def plan(
-        self,
-        tau: int,
-        which: NDArray[np.intp],
-        x: Array,
-        g: Constraint,
-        calls: NDArray[np.int_],
-        total_s: float,
-        network_s: float,
-    ) -> None:
-        """Plans x [which, horizon, dim] made at step tau, g the constraint as it was then, environment units."""
-        self.calls[which, tau] = calls
-        self.violation[which, tau] = g(torch.from_numpy(x)).clamp_min(0).sum(1).numpy()
-        self.latency.append(total_s)
-        self.network.append(network_s)
-        self.levels = g.state_values(torch.from_numpy(x)).numpy()
-        self.rows = {int(i): row for row, i in enumerate(which)}
+    def plan(self, tau: int, which: NDArray[np.intp], plan: Plan) -> None:
+        """The plans of these episodes, made at step tau."""
+        self.calls[which, tau] = plan.calls
+        self.violation[which, tau] = plan.violation
+        self.latency.append(plan.total_s)
+        self.network.append(plan.network_s)
 
     def end(
         self, flags: NDArray[np.bool_], which: NDArray[np.intp], ended: Any
@@ -103,12 +97,14 @@ class Log:
         flags[which[ended]] = True
         return which[~ended]
 
-    def foresee(self, tau: int, states: Array, which: NDArray[np.intp], waypoint: int) -> None:
-        self.planned[which, tau] = states
-        rows = [self.rows[int(i)] for i in which]
-        self.foreseen[which, tau] = self.levels[rows, waypoint]
+    def predict(self, tau: int, which: NDArray[np.intp], states: Array, levels: Array) -> None:
+        """What the plans predict for step tau: states [n, dim], constraint values [n, parts]."""
+        self.predicted[which, tau] = states
+        self.predicted_levels[which, tau] = levels
 
-    def act(self, tau: int, i: int, u: Array, reward: float, info: Mapping[str, Any]) -> None:
+    def act(
+        self, tau: int, i: int, u: NDArray[np.float32], reward: float, info: Mapping[str, Any]
+    ) -> None:
         self.u[i, tau], self.reward[i, tau] = u, reward
         for name, value in info.items():
             if isinstance(value, bool | int | float | np.number | np.bool_):
@@ -121,8 +117,8 @@ class Log:
             x=self.x,
             u=self.u,
             reward=self.reward,
-            planned=self.planned,
-            foreseen=self.foreseen,
+            predicted=self.predicted,
+            predicted_levels=self.predicted_levels,
             observed=self.observed,
             violation=self.violation,
             calls=self.calls,

@@ -1,7 +1,6 @@
-"""A planning problem with all that sampling needs, its pins, and whether it can be met at its ends."""
+"""A planning problem with all that sampling needs, its pins, and whether its ends are feasible."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,83 +10,99 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.rate import RateLimit, refuse_contradiction
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError, InfeasibleError
-from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.normaliser import Normaliser
-from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.models.planner import Planner
+from cdiff_cli.tasks.protocol import HasMap, Task, Tolerances
 
-MARGIN = (
-    1e-6  # how far inside the polish puts a plan, environment units: above every solver's tolerance
-)
+POLISH_MARGIN = 1e-6
+"""The final projection tightens g by this, environment units; larger than every solver's tolerance."""
+
+
+DEFAULT_TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
 class Problem:
-    """All that sampling needs, resolved.
+    """Whole plans to be made.
 
-    g            as declared, at the waypoints: what is scored                       environment units
-    enforced     what sampling obeys: g, taken on the segments where that is asked   environment units
-    start, goal  pinned states [dim], or one a plan [n, dim], or None
+    declared     g as declared, at the waypoints: what is scored        environment units
+    enforced     what plans satisfy: g on segments, dynamics, margins   environment units
+    start, goal  pinned states [dim], or one per plan [n, dim], or None
     """
 
-    task: Task
-    horizon: int
-    denoiser: Denoiser
-    schedule: Schedule
-    normaliser: Normaliser
-    g: Constraint
+    planner: Planner
+    declared: Constraint
     enforced: Constraint
-    start: Array | None
-    goal: Array | None
-    device: torch.device
+    start: Array | None = None
+    goal: Array | None = None
+    tolerances: Tolerances = DEFAULT_TOLERANCES
+
+    @property
+    def normaliser(self) -> Normaliser:
+        """The planner's normaliser, the same for every plan.
+
+        Raises CdiffError where windows are relative to a first state.
+        """
+        if not isinstance(self.planner.normaliser, Normaliser):
+            raise CdiffError(
+                "this planner sees windows relative to a first state; act with a controller"
+            )
+        return self.planner.normaliser
+
+    def pins(
+        self, n: int, dtype: torch.dtype = torch.float32, device: torch.device | None = None
+    ) -> Pins:
+        """The start as the first waypoint, the goal as the last, of n plans, normalised.
+
+        device   None: the planner's
+        """
+        shape = (self.planner.horizon, self.planner.dim)
+        mask = torch.zeros(shape, dtype=torch.bool)
+        values = torch.zeros((n, *shape), dtype=torch.float64)
+        for index, state in ((0, self.start), (-1, self.goal)):
+            if state is not None:
+                mask[index] = True
+                values[:, index] = self.normaliser.encode(torch.from_numpy(state))
+        where = self.planner.device if device is None else device
+        return Pins(mask.to(where), values.to(where, dtype))
 
 
-def check_feasible(problem: Problem) -> None:
-    """Refuse a start or goal inside a wall or outside the constraints, before anything is sampled."""
-    columns = [problem.task.layout.index(name) for name in problem.task.positions]
+def check_feasible(problem: Problem, task: Task | None = None) -> None:
+    """Refuse a start or goal inside a wall of the task or outside the constraints.
+
+    Raises CdiffError, or InfeasibleError where a constraint is the reason, before anything is sampled.
+    """
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
-            _check_pin(problem, name, state, columns)
-    refuse_contradiction([part for part in problem.g.parts if isinstance(part, RateLimit)])
-    for part in problem.g.parts:
-        if isinstance(part, RateLimit) and problem.start is not None and problem.goal is not None:
-            pins = make_pins(
-                problem, len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu")
-            )
-            part.pull_back(problem.normaliser.centre, problem.normaliser.scale).refuse_pins(
-                pins, MARGIN
-            )
+            _check_end(problem, task, name, state)
+    refuse_contradiction([part for part in problem.declared.parts if isinstance(part, RateLimit)])
+    if problem.start is None or problem.goal is None:
+        return
+    pins = problem.pins(len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu"))
+    for part in problem.declared.parts:
+        if isinstance(part, RateLimit):
+            normaliser = problem.normaliser
+            part.pull_back(normaliser.centre, normaliser.scale).refuse_pins(pins, POLISH_MARGIN)
 
 
-def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) -> None:
-    point = ", ".join(
-        f"{c} = {v:g}" for c, v in zip(problem.task.positions, state[columns], strict=True)
-    )
-    task: Any = problem.task
-    if hasattr(task, "is_free") and not task.is_free(state[columns], task.footprint):
+def _check_end(problem: Problem, task: Task | None, name: str, state: Array) -> None:
+    columns = problem.planner.position_columns
+    names = [problem.planner.coordinates[column] for column in columns]
+    point = ", ".join(f"{c} = {v:g}" for c, v in zip(names, state[columns], strict=True))
+    if (
+        task is not None
+        and isinstance(task, HasMap)
+        and not task.is_free(state[columns], task.footprint)
+    ):
         raise CdiffError(
-            f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}"
+            f"the {name} ({point}) is inside a wall or touches one; "
+            f"choose a free point of {task.name}"
         )
-    for part in problem.g.parts:
+    for part in problem.declared.parts:
         level = getattr(part, "level", None)
         value = float(level(torch.from_numpy(state))) if level is not None else 0.0
         if value > 0:
             raise InfeasibleError(
-                f'the constraint "{part.name}" excludes the {name} ({point}): g = {value:.3g} there, must be <= 0; '
-                f"move the {name} or relax the constraint"
+                f'the constraint "{part.name}" excludes the {name} ({point}): '
+                f"g = {value:.3g} there, must be <= 0; move the {name} or relax the constraint"
             )
-
-
-def make_pins(
-    problem: Problem, n: int, dtype: torch.dtype = torch.float32, device: torch.device | None = None
-) -> Pins:
-    """The start as the first waypoint, the goal as the last, in normalised coordinates."""
-    dim = len(problem.task.layout)
-    mask = torch.zeros(problem.horizon, dim, dtype=torch.bool)
-    values = torch.zeros(n, problem.horizon, dim, dtype=torch.float64)
-    for index, state in ((0, problem.start), (-1, problem.goal)):
-        if state is not None:
-            mask[index] = True
-            values[:, index] = problem.normaliser.encode(torch.from_numpy(state))
-    device = problem.device if device is None else device
-    return Pins(mask.to(device), values.to(device, dtype))

@@ -1,6 +1,5 @@
 """What a plan of receding-horizon control takes over from the last one: the plan itself, moved on, and the multipliers."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.projection.segments import row_blocks
 from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
-from cdiff_cli.sampling.sampler import Method, Step
+from cdiff_cli.sampling.sampler import Method
 
 
 def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
@@ -25,44 +24,50 @@ def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
     return y
 
 
-@dataclass
-class CarriedMultipliers:
-    """The method, begun with the multipliers that the last plan ended with, moved on by `tighten` waypoints: reset, they would have
-    to be found again in the few steps of a warm plan.
+def carry(method: Method, last: Any, g: Constraint, x: Traj, executed: int) -> Any:
+    """State that the method begins the next plan with: fresh, but with the multipliers that the last plan ended with.
 
-    state   of the method after its last step; None to begin anew
+    The multipliers move forward by the executed waypoints, block by block, and those of the new waypoints begin at zero.
+    Begun at zero altogether, they would have to be found again in the few steps of a warm-started plan.
+    A penalty weight begins anew. Multipliers of another number of rows or plans are dropped.
+
+    last       state after the last step of the last plan, of the same plans in the same order; None: begin afresh
+    g          the constraint that sample() is given
+    x          any tensor of the plans' shape [batch, horizon, dim], type and device
+    executed   waypoints by which the present plan begins later than the last
     """
+    fresh = method.init(x, g)
+    if isinstance(fresh, AlmState):
+        lam = last.lam if isinstance(last, AlmState) else None
+        return fresh._replace(lam=_moved(method, fresh.lam, lam, g, x.shape[1], executed))
+    return (
+        _moved(method, fresh, last, g, x.shape[1], executed)
+        if isinstance(fresh, torch.Tensor)
+        else fresh
+    )
 
-    method: Method
-    shift: int
-    state: Any = None
 
-    def init(self, x: Traj, g: Constraint) -> Any:
-        fresh, last = self.method.init(x, g), self.state
-        if isinstance(fresh, AlmState) and isinstance(last, AlmState):
-            return fresh._replace(lam=self._moved(fresh.lam, last.lam, g, x.shape[1]))
-        return self._moved(fresh, last, g, x.shape[1]) if isinstance(fresh, torch.Tensor) else fresh
+def select(state: Any, plans: NDArray[np.bool_]) -> Any:
+    """State of some of the plans; multipliers shared by all plans stay as they are.
 
-    def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]:
-        x, self.state = self.method.step(step, g, state)
-        return x, self.state
+    plans   which of them   [batch]
+    """
+    if isinstance(state, AlmState):
+        return state._replace(lam=select(state.lam, plans))
+    if isinstance(state, torch.Tensor) and len(state) == len(plans):
+        return state[torch.from_numpy(plans)]
+    return state
 
-    def select(self, which: NDArray[np.bool_]) -> Any:
-        """The state of some of the episodes alone; multipliers that all share are theirs too."""
-        state, some = self.state, torch.from_numpy(which)
-        if isinstance(state, AlmState):
-            return state._replace(lam=state.lam[some] if len(state.lam) == len(some) else state.lam)
-        return state[some] if isinstance(state, torch.Tensor) and len(state) == len(some) else state
 
-    def _moved(self, fresh: Rows, last: Any, g: Constraint, horizon: int) -> Rows:
-        """The last rows moved on block by block, the new ones at the end as they begin."""
-        if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
-            return fresh
-        out, planes = (
-            fresh.clone(),
-            isinstance(self.method, PrimalDual | AugmentedLagrangian) and self.method.on != "noisy",
-        )
-        for block in row_blocks(g, horizon, planes):
-            kept = max(block.stop - block.start - self.shift, 0)
-            out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
-        return out
+def _moved(
+    method: Method, fresh: Rows, last: Any, g: Constraint, horizon: int, executed: int
+) -> Rows:
+    """The last multipliers moved forward block by block; new rows at the end of a block stay as in `fresh`."""
+    if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
+        return fresh
+    out = fresh.clone()
+    planes = isinstance(method, PrimalDual | AugmentedLagrangian) and method.on != "noisy"
+    for block in row_blocks(g, horizon, planes):
+        kept = max(block.stop - block.start - executed, 0)
+        out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
+    return out

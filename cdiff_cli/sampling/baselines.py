@@ -1,13 +1,14 @@
 """What the paper's methods are compared with, besides SafeDiffuser: each a few lines on the seams of methods.py."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
 from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.sampler import Step
+from cdiff_cli.sampling.sampler import PlannerKind, Step
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,11 @@ class Guidance:
 
     weight   5.5e-3 as released
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     weight: float = 5.5e-3
 
@@ -39,6 +45,11 @@ class Conditional:
     weight   of classifier-free guidance: 1 is the conditioned estimate itself, above it two network calls a step
     """
 
+    enforces: ClassVar[bool] = False
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "conditional"
+
     weight: float = 2.0
 
     def init(self, x: Traj, g: Constraint) -> None:
@@ -51,6 +62,11 @@ class Conditional:
 @dataclass(frozen=True)
 class FinalProjection:
     """The unconstrained plan, projected once when it is done."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     def init(self, x: Traj, g: Constraint) -> None:
         return None
@@ -67,7 +83,15 @@ class BestOf:
     k   plans a seed; the network calls are k-fold
     """
 
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = False
+    planner: ClassVar[PlannerKind] = "unconditional"
+
     k: int = 8
+
+    @property
+    def candidates(self) -> int:
+        return self.k
 
     def init(self, x: Traj, g: Constraint) -> None:
         return None

@@ -16,7 +16,7 @@ What the paper compares with stands in safediffuser.py and baselines.py; METHODS
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any, Literal, NamedTuple, cast, get_args, get_type_hints
+from typing import Any, ClassVar, Literal, NamedTuple, cast, get_args, get_type_hints
 
 import torch
 from torch.nn import functional as F
@@ -34,7 +34,7 @@ from cdiff_cli.projection.segments import (
 )
 from cdiff_cli.sampling.baselines import BestOf, Conditional, FinalProjection, Guidance
 from cdiff_cli.sampling.safediffuser import SafeDiffuser
-from cdiff_cli.sampling.sampler import Method, Step
+from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 On = Literal["noisy", "clean"]
 DualOn = Literal["noisy", "estimate", "clean"]
@@ -47,6 +47,11 @@ Coefficient = Literal["beta/2", "one"]
 @dataclass(frozen=True)
 class Unconstrained:
     """Diffuser: x_{t-1} = reverse(x0), constraints ignored."""
+
+    enforces: ClassVar[bool] = False
+    polished: ClassVar[bool] = False
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     def init(self, x: Traj, g: Constraint) -> None:
         return None
@@ -62,6 +67,11 @@ class Projected:
     correction   on clean, how the projection reaches x_{t-1}. kernel: as the reverse step weighs a clean estimate. latent: whole,
                  x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0), which keeps the noise that was estimated
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     on: On = "clean"
     correction: Correction = "kernel"
@@ -92,6 +102,11 @@ class PrimalDual:
     expectation  E g: each plan its own multipliers, or one set for the batch mean (the paper's formula)
     positive     none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part (paper, Remark 1)
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     on: DualOn = "clean"
     eta: float = 1.0
@@ -146,6 +161,11 @@ class AugmentedLagrangian:
     c            its growth a step
     coefficient, expectation, positive   as in PrimalDual
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     on: DualOn = "clean"
     rho: float = 0.5

@@ -13,7 +13,7 @@ join waypoints (barrier chains, segments) make one QP a plan.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
-from cdiff_cli.sampling.sampler import Step
+from cdiff_cli.sampling.sampler import PlannerKind, Step
 
 Variant = Literal["ros", "res", "tvs"]
 Solver = Literal["closed-form", "proxqp"]
@@ -51,6 +51,11 @@ class SafeDiffuser:
     gain      k, the share of the barrier that a step may use up: 1 as released
     margin    how far inside the rows ask to be, units of g: 0.01 as released
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     variant: Variant = "ros"
     solver: Solver = "closed-form"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 
@@ -37,11 +37,40 @@ class Step:
     left: int = 0
 
 
-class Method(Protocol):
-    """A way to obey g <= 0 while sampling: hyper-parameters only, its state is passed in and returned."""
+PlannerKind = Literal["unconditional", "conditional"]
 
+
+class Method(Protocol):
+    """A method acts on g <= 0 in every reverse step; it holds hyper-parameters only, its state is passed in and returned.
+
+    Attributes of the class, which say how a plan made with the method is treated:
+
+    enforces     The sampled plans depend on g, so margins that tighten g change them. False for `diffuser` and `conditional`.
+    polished     The final projection applies to the plans, and a warm plan that violates g is made anew from noise.
+                 False for `diffuser` and `best-of-k`, whose plans stay as the network made them.
+    candidates   Plans sampled per seed, of which the one with the least sum of [g]_+ is kept: k of `best-of-k`, else 1.
+    planner      The checkpoint that it samples from: the task's, or the one trained with constraint labels.
+
+    Only `diffuser` is neither enforcing nor polished: its plans are the unconstrained plans that others are compared with.
+    """
+
+    @property
+    def enforces(self) -> bool: ...
+    @property
+    def polished(self) -> bool: ...
+    @property
+    def candidates(self) -> int: ...
+    @property
+    def planner(self) -> PlannerKind: ...
     def init(self, x: Traj, g: Constraint) -> Any: ...
     def step(self, step: Step, g: Constraint, state: Any) -> tuple[Traj, Any]: ...
+
+
+class Sample(NamedTuple):
+    """Plans x_0, normalised [batch, horizon, dim], and the method's state after its last step."""
+
+    x: Traj
+    state: Any
 
 
 def sample(
@@ -55,16 +84,18 @@ def sample(
     kernel: Kernel = ddpm,
     extra_steps: int = 0,
     first: Traj | None = None,
+    state: Any = None,
     on_step: Callable[[int, Step, Traj], None] | None = None,
-) -> Traj:
-    """Plans x_0 in normalised coordinates [batch, horizon, dim].
+) -> Sample:
+    """Draw plans x_0: the only loop over the diffusion steps.
 
     first        x_T, the schedule's noisiest; drawn where None
     extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
+    state        the method's state before its first step; method.init() where None
     on_step      called with the number of network calls so far, the step and x_{t-1}
     """
     x = pins.paint(noise() if first is None else first)
-    state = method.init(x, g)
+    state = method.init(x, g) if state is None else state
     used: Previous | None = None
     for call, i in enumerate([*range(schedule.n_steps, 0, -1), *[1] * extra_steps], start=1):
         x0 = pins.paint(denoiser(x, schedule.t[i]))
@@ -89,4 +120,4 @@ def sample(
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)
-    return x
+    return Sample(x, state)

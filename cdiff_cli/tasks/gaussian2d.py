@@ -1,17 +1,16 @@
 """Figure 1 of the paper: points of a 2-D Gaussian kept outside a disc, sampled with the exact score."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from cdiff_cli.arrays import Traj
+from cdiff_cli.arrays import Array, Traj
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.tasks.protocol import Tolerances
+from cdiff_cli.tasks.protocol import Control, Tolerances
 
 
 class Gaussian2D:
@@ -24,6 +23,7 @@ class Gaussian2D:
     velocities: tuple[str, ...] = ()
     shared_scale = (("x", "y"),)
     dt = 1.0
+    control: Control = "open_loop"
     tolerances = Tolerances()
     scale = 1.5  # of the normalised coordinates
 
@@ -32,7 +32,7 @@ class Gaussian2D:
         turn = torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
         return turn @ torch.diag(torch.tensor([1.5, 1.0], dtype=torch.float64).square()) @ turn.T
 
-    def denoiser(self, schedule: Schedule) -> Any:
+    def denoiser(self, schedule: Schedule) -> Callable[[Traj, int], Traj]:
         """E[x_0 | x_t] = sqrt(a) S (a S + (1 - a) I)^-1 x_t, exactly, in normalised coordinates."""
         covariance = self.covariance() / self.scale**2
         level = dict(zip(schedule.t, schedule.alpha_bar, strict=True))
@@ -48,27 +48,18 @@ class Gaussian2D:
 
         return clean
 
-    def truth(self, n: int, seed: int) -> NDArray[np.float64]:
+    def truth(self, n: int, seed: int) -> Array:
         """Exact samples of the unconstrained law [n, 2]."""
         rng = np.random.default_rng(seed)
         return rng.multivariate_normal(np.zeros(2), self.covariance().numpy(), n)
-
-    def walls(self) -> NDArray[np.float64]:
-        return np.empty((0, 4))
 
     def make_env(self, render: bool = False) -> Any:
         raise CdiffError(
             "gaussian2d is a distribution, not an environment: it can be planned, not rolled out or trained"
         )
 
-    def demonstrate(self, n_steps: int, seed: int) -> Iterator[dict[str, Any]]:
-        raise CdiffError("gaussian2d needs no training: its score is exact")
-
-    def observe(self, obs: Any) -> NDArray[np.float64]:
+    def observe(self, obs: Any) -> Array:
         return np.asarray(obs, dtype=np.float64)
-
-    def from_d4rl(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        return states
 
 
 GAUSSIAN2D = Gaussian2D()

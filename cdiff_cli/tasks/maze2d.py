@@ -10,13 +10,13 @@ import io
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.tasks.protocol import Tolerances
+from cdiff_cli.tasks.protocol import Control, Tolerances
 
 Cell = tuple[int, int]
 DT = 0.01
@@ -46,6 +46,7 @@ class Maze2D:
     velocities = ("vx", "vy")
     shared_scale = (("x", "y"), ("vx", "vy"))
     dt = DT
+    control: ClassVar[Control] = "open_loop"
     tolerances = Tolerances()
     footprint = BALL_RADIUS  # m, which a start and a goal must have free around them
     success_radius = SUCCESS_RADIUS

@@ -15,7 +15,13 @@ from filelock import FileLock
 from cdiff_cli.arrays import Array
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.paths import home
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import (
+    ControlTask,
+    Demonstrates,
+    HasExactScore,
+    ReadsD4RL,
+    Task,
+)
 
 Progress = Callable[[int, int], None]
 
@@ -27,6 +33,8 @@ def demonstrations(
     `cdiff/<task>-v0`, reused when its steps, seed, generating code and content hash are the expected ones. Processes that
     ask at the same time wait for the first.
     """
+    if isinstance(task, HasExactScore):
+        raise CdiffError(f"{task.name} needs no training: its score is exact")
     minari = _minari()
     root = Path(minari.storage.get_dataset_path())
     root.mkdir(parents=True, exist_ok=True)
@@ -37,6 +45,8 @@ def demonstrations(
 def _stored_demonstrations(
     minari: Any, task: Task, steps: int, seed: int, progress: Progress | None
 ) -> list[Array]:
+    if not isinstance(task, Demonstrates):
+        raise CdiffError(f"{task.name} generates no demonstrations; name a dataset with --dataset")
     name = f"cdiff/{task.name}-v0"
     recipe = {"cdiff_steps": steps, "cdiff_seed": seed, "cdiff_code": _code(task)}
     if name in minari.list_local_datasets():
@@ -90,7 +100,7 @@ def load_inputs(task: Task, source: str) -> list[Array]:
     task's HDF5 file, whose inputs keep its own frame.
     """
     if Path(source).suffix in (".hdf5", ".h5"):
-        actions = getattr(task, "actions", ())
+        actions = task.actions if isinstance(task, ControlTask) else ()
         return (
             [_checked(u, task, source, "actions", actions) for u in _hdf5(Path(source), "actions")]
             if actions
@@ -187,7 +197,10 @@ def _minari_episodes(minari: Any, name: str, task: Task) -> tuple[list[Array], d
 
 def _hdf5_episodes(path: Path, task: Task) -> Iterator[Array]:
     for episode in _hdf5(path, "observations"):
-        yield _checked(task.from_d4rl(_checked(episode, task, str(path))), task, str(path))
+        states = _checked(episode, task, str(path))
+        if isinstance(task, ReadsD4RL):
+            states = _checked(task.from_d4rl(states), task, str(path))
+        yield states
 
 
 def _hdf5(path: Path, name: str, why: str = "") -> list[Array]:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +10,7 @@ from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.observed import Observed, ObservedValues
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.tasks.protocol import Task, observable_of
 
 LABELS = 2  # entries of a label
 
@@ -31,12 +31,10 @@ class ConstraintLabel:
     observed: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, path: Path, task: Any) -> "ConstraintLabel":
+    def read(cls, path: Path, task: Task) -> "ConstraintLabel":
         """The constraints of a file; raises SpecError."""
-        observable = getattr(task, "observable", ())
-        kinds, g = load_constraints(
-            path, task.name, task.layout, None, observable, getattr(task, "dt", None)
-        )
+        observable = observable_of(task)
+        kinds, g = load_constraints(path, task.name, task.layout, None, observable, task.dt)
         waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
         return cls(
             path.stem, g, kinds_sha256(kinds), tuple(name for name in observable if name in waits)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.denoiser import ObservationEncoder
 from cdiff_cli.models.normaliser import LEAST, Normaliser, ResidualNormaliser
 from cdiff_cli.models.recipe import Recipe, TrainSpec
-from cdiff_cli.tasks.protocol import ControlTask, Task
+from cdiff_cli.tasks.protocol import ControlTask, DrawsObservations, Task
 from cdiff_cli.training.labels import ConstraintLabel, drop
 from cdiff_cli.training.return_labels import ReturnLabel
 
@@ -49,8 +48,7 @@ class SampledObservations:
         cls, task: Task, episodes: Sequence[Array], names: tuple[str, ...], seed: int
     ) -> "SampledObservations":
         """Drawn by the task's own law (observed_along); CdiffError where it has none."""
-        law = getattr(task, "observed_along", None)
-        if law is None:
+        if not isinstance(task, DrawsObservations):
             raise CdiffError(
                 f"{task.name}: the constraints observe {', '.join(names)}, which demonstrations do not hold, and the task has no "
                 "observed_along to draw them by; train for constraints without observed quantities"
@@ -58,7 +56,7 @@ class SampledObservations:
         rng = np.random.default_rng(seed)
         copies = []
         for _ in range(COPIES):
-            seen = [law(episode, rng) for episode in episodes]
+            seen = [task.observed_along(episode, rng) for episode in episodes]
             copies.append(
                 np.concatenate([np.stack([each[name] for name in names], 1) for each in seen])
             )
@@ -193,9 +191,8 @@ class TrainingSet:
             windows = Windows.from_episodes(
                 [e.astype(np.float32) for e in episodes], recipe.horizon
             )
-            frame = fit_residual_normaliser(
-                windows, task.layout, task.shared_scale, cast(ControlTask, task).invariant
-            )
+            invariant = task.invariant if isinstance(task, ControlTask) else ()
+            frame = fit_residual_normaliser(windows, task.layout, task.shared_scale, invariant)
             pinned[-1] = False
             return cls(windows, frame.state, frame, pinned, *asked)
         normaliser = Normaliser.fit(np.concatenate(episodes), task.layout, task.shared_scale)

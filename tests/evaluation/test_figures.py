@@ -19,7 +19,13 @@ DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=5.0), "disc")
 
 def task(walls=BOXES[:0], units=("m", "m")):
     return SimpleNamespace(
-        layout=("x", "y"), positions=("x", "y"), units=units, dt=0.1, walls=lambda: walls
+        layout=("x", "y"),
+        positions=("x", "y"),
+        units=units,
+        dt=0.1,
+        walls=lambda: walls,
+        footprint=0.0,
+        is_free=lambda *_: True,
     )
 
 

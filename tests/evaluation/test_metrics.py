@@ -227,6 +227,8 @@ def test_plan_metrics_measure_each_plan_in_the_tasks_columns():
         velocities=("vx", "vy"),
         dt=1.0,
         walls=lambda: BOX,
+        footprint=0.0,
+        is_free=lambda *_: True,
     )
     g = Constraint((AtWaypoints("left", HalfSpace(vec(1.0, 0.0, 0.0, 0.0), num(1.0))),))
     x = np.zeros((2, 2, 4))
@@ -271,6 +273,8 @@ def test_wall_hits_need_walls_not_velocities():
             velocities=velocities,
             dt=1.0,
             walls=lambda: boxes,
+            footprint=0.0,
+            is_free=lambda *_: True,
         )
         x = np.full((1, 2, 4), 0.5)
         return plan_metrics(task, Constraint(()), x, x, SimpleNamespace(violation=1.0))[0]
@@ -285,8 +289,8 @@ def test_only_contact_of_what_the_environment_reports_is_a_metric():
         x=np.zeros((1, 3, 2)),
         u=np.array([[[1.0], [0.2]]]),
         reward=np.array([[1.0, np.nan]]),
-        planned=np.zeros((1, 3, 2)),
-        foreseen=np.zeros((1, 3, 1)),
+        predicted=np.zeros((1, 3, 2)),
+        predicted_levels=np.zeros((1, 3, 1)),
         observed={},
         violation=np.array([[0.5, np.nan]]),
         calls=np.array([[4.0, np.nan]]),

@@ -68,7 +68,7 @@ def test_sampling_names_the_device_of_every_tensor(file, method):
             pins,
             lambda: next(draws),
             kernel=KERNELS["ddpm"],
-        )
+        ).x
 
     twice(work)
 
@@ -113,6 +113,6 @@ def test_plans_of_control_name_the_device_of_every_tensor(task, method):
             pins,
             lambda: next(left),
             kernel=KERNELS["ddpm"],
-        )
+        ).x
 
     twice(work)

@@ -1,5 +1,6 @@
 """Multipliers carried from one plan to the next: each lands on the row that it belonged to, moved on by the steps executed."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -7,9 +8,9 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
-from cdiff_cli.planning.warm_start import CarriedMultipliers
+from cdiff_cli.planning.warm_start import carry, select
 from cdiff_cli.projection.segments import with_tangent_planes
-from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
+from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual, Projected
 from cdiff_cli.sampling.sampler import Step
 from tests.problems import F64, ball, half_space, normal
 
@@ -27,9 +28,10 @@ PLANES = {
 
 def carried(method, last, steps=1):
     """The multipliers that a plan begins with, after one that ended with `last`."""
-    state = method.init(torch.zeros(1, H, 2, dtype=F64), G)
+    x = torch.zeros(1, H, 2, dtype=F64)
+    state = method.init(x, G)
     ended = AlmState(last, 0.9) if isinstance(state, AlmState) else last
-    begun = CarriedMultipliers(method, steps, ended).init(torch.zeros(1, H, 2, dtype=F64), G)
+    begun = carry(method, ended, G, x, steps)
     if isinstance(begun, AlmState):
         assert begun.rho == method.rho
         return begun.lam
@@ -50,6 +52,27 @@ def test_other_numbers_of_steps(steps):
     last = 1 + torch.arange(15, dtype=F64)[None]
     blocks = [block[steps:] + min(steps, H) * [0.0] for block in last.view(3, H).tolist()]
     assert carried(PrimalDual(), last, steps).view(3, H).tolist() == blocks
+
+
+def test_without_a_last_plan_the_multipliers_begin_at_zero():
+    x = torch.zeros(2, H, 2, dtype=F64)
+    assert carry(PrimalDual(), None, G, x, 1).tolist() == [15 * [0.0]] * 2
+    assert carry(Projected(), None, G, x, 1) is None
+
+
+def test_multipliers_of_another_number_of_plans_are_dropped():
+    x = torch.zeros(2, H, 2, dtype=F64)
+    assert not carry(PrimalDual(), torch.ones(3, 15, dtype=F64), G, x, 1).any()
+
+
+def test_selected_plans_keep_their_own_multipliers_and_shared_ones_are_kept_whole():
+    lam, which = torch.tensor([[1.0], [2.0], [3.0]]), np.array([True, False, True])
+    assert select(lam, which).tolist() == [[1.0], [3.0]]
+    kept = select(AlmState(lam, 0.9), which)
+    assert kept.lam.tolist() == [[1.0], [3.0]]
+    assert kept.rho == 0.9
+    assert select(torch.tensor([[4.0]]), which).tolist() == [[4.0]]
+    assert select(None, which) is None
 
 
 @pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])

@@ -45,7 +45,7 @@ def plans(method, g):
         g,
         Pins.none(like),
         draws(7, 8, 4, 2),
-    )
+    ).x
 
 
 def test_guidance_pushes_every_row_by_its_weight_violated_or_not():
@@ -142,3 +142,20 @@ def test_candidates_of_neighbouring_seeds_share_no_noise():
 
 def test_every_method_has_its_place_in_tables_and_help():
     assert set(METHODS) == set(METHOD_ORDER)
+
+
+def test_only_these_methods_are_treated_differently():
+    methods = {name: make_method(name, {}) for name in METHODS}
+    assert {name for name, method in methods.items() if not method.enforces} == {
+        "diffuser",
+        "conditional",
+    }
+    assert {name for name, method in methods.items() if not method.polished} == {
+        "diffuser",
+        "best-of-k",
+    }
+    assert {name for name, method in methods.items() if method.planner == "conditional"} == {
+        "conditional"
+    }
+    assert {method.candidates for name, method in methods.items() if name != "best-of-k"} == {1}
+    assert make_method("best-of-k", {"k": 3}).candidates == 3

@@ -169,7 +169,7 @@ def _plan(method, g, n=16, horizon=4, dim=2, **keywords):
     denoiser = gaussian_denoiser(SCHEDULE, 0.5, 0.1)
     return sample(
         denoiser, SCHEDULE, method, g, Pins.none(like), draws(7, n, horizon, dim), **keywords
-    )
+    ).x
 
 
 def test_unconstrained_ignores_g():
@@ -231,7 +231,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
         pin(line, 0, -1),
         noise,
         extra_steps=20,
-    ), g
+    ).x, g
 
 
 @pytest.mark.parametrize(
@@ -295,7 +295,7 @@ def test_every_method_meets_the_same_noise():
         seen.append(
             sample(
                 gaussian_denoiser(SCHEDULE, 0.5, 0.1), SCHEDULE, method, g32, Pins.none(like), noise
-            )
+            ).x
         )
     for other in seen[1:]:
         assert torch.equal(other, seen[0])

@@ -208,7 +208,7 @@ def test_whole_plans_end_safe(variant):
             g,
             Pins.none(like),
             draws(7, 8, 4, 2),
-        )
+        ).x
         for method in (Unconstrained(), SafeDiffuser(variant))
     ]
     assert float(g(plans[0]).max()) > 0.1

@@ -39,7 +39,9 @@ def _gaussian(kernel, n_steps, n=N):
     schedule = Schedule.cosine(n_steps)
     pins = Pins.none(torch.zeros(n, 1, 1, dtype=F64))
     denoiser = gaussian_denoiser(schedule, MEAN, STD)
-    return sample(denoiser, schedule, Unconstrained(), FREE, pins, draws(0, n, 1, 1), kernel=kernel)
+    return sample(
+        denoiser, schedule, Unconstrained(), FREE, pins, draws(0, n, 1, 1), kernel=kernel
+    ).x
 
 
 # known answers --------------------------------------------------------------------------------------------------------
@@ -117,7 +119,9 @@ def _flow_error(kernel, schedule, std):
     constant = (x - math.sqrt(start) * MEAN) / math.sqrt(start * std**2 + 1 - start)
     exact = math.sqrt(stop) * MEAN + math.sqrt(stop * std**2 + 1 - stop) * constant
     denoiser = gaussian_denoiser(schedule, MEAN, std)
-    out = sample(denoiser, schedule, Unconstrained(), FREE, Pins.none(x), lambda: x, kernel=kernel)
+    out = sample(
+        denoiser, schedule, Unconstrained(), FREE, Pins.none(x), lambda: x, kernel=kernel
+    ).x
     return float((out - exact).square().mean().sqrt())
 
 
@@ -254,7 +258,7 @@ def _record(extra_steps, method=None, kernel=ddpm, b=0.2, n_steps=12):
         kernel=kernel,
         extra_steps=extra_steps,
         on_step=lambda call, step, out: seen.append((call, step, out)),
-    )
+    ).x
     return x, calls, seen
 
 
@@ -366,7 +370,7 @@ def test_deterministic_kernels_need_no_noise_but_the_first(kernel):
                 pins,
                 noise,
                 kernel=kernel,
-            )
+            ).x
         )
     assert torch.equal(*outs)
 
@@ -374,6 +378,33 @@ def test_deterministic_kernels_need_no_noise_but_the_first(kernel):
 def _first_then(first, later):
     queue = [first]
     return lambda: queue.pop() if queue else later()
+
+
+def test_a_chain_split_in_two_with_the_state_handed_on_is_the_whole_chain():
+    """Frozen steps alone: 3 + 4 of them, begun where the first 3 ended, are 7."""
+    schedule, like = Schedule.cosine(1), torch.zeros(2, 3, 2, dtype=F64)
+    denoiser = gaussian_denoiser(schedule, MEAN, STD)
+    method, g, x = PrimalDual(eta=0.3), waypoints(half_space(b=-1.0)), normal(3, 2, 3, 2)
+
+    def go(first, frozen, state=None):
+        return sample(
+            denoiser,
+            schedule,
+            method,
+            g,
+            Pins.none(like),
+            lambda: like,
+            kernel=ddim,
+            extra_steps=frozen,
+            first=first,
+            state=state,
+        )
+
+    whole, half = go(x, 6), go(x, 2)
+    rest = go(half.x, 3, half.state)
+    assert torch.equal(rest.x, whole.x)
+    assert torch.equal(rest.state, whole.state)
+    assert not torch.equal(go(half.x, 3).x, whole.x)
 
 
 # noise ----------------------------------------------------------------------------------------------------------------
@@ -398,7 +429,7 @@ def test_the_plan_of_a_seed_does_not_depend_on_its_neighbours():
             g,
             Pins.none(like),
             Noise(seeds, (3, 2)),
-        )
+        ).x
 
     assert torch.equal(plans([7])[0], plans([1, 7, 4])[1])
 

@@ -15,6 +15,7 @@ from cdiff_cli.tasks.maze2d import UMAZE
 from cdiff_cli.tasks.mujoco import gait_search, locomotion
 from cdiff_cli.tasks.mujoco.gait_search import SEARCHES, Whitening, measure, search_gait
 from cdiff_cli.tasks.mujoco.locomotion import BRANCH_SHARE, HOPPER, SWIMMER, Gait
+from cdiff_cli.tasks.protocol import observed_in, walls_of
 from cdiff_cli.training.demonstrations import demonstrations, load_dataset
 
 TASKS = [HOPPER, SWIMMER]
@@ -60,9 +61,9 @@ def test_an_episode_of_observations_is_observed_at_once(task):
 
 def test_nothing_is_observed_around_a_walker_and_nothing_stands_in_its_way():
     env = SWIMMER.make_env()
-    assert SWIMMER.observed(env) == {}
+    assert observed_in(SWIMMER, env) == {}
     env.close()
-    assert SWIMMER.walls().shape == (0, 4)
+    assert walls_of(SWIMMER).shape == (0, 4)
 
 
 # the shipped gaits ----------------------------------------------------------------------------------------------------

@@ -14,6 +14,8 @@ from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.tasks import TASKS, load_task
 from cdiff_cli.tasks.gaussian2d import GAUSSIAN2D
 from cdiff_cli.tasks.maze2d import BALL_RADIUS, LARGE, MAX_SPEED, UMAZE, Maze2D
+from cdiff_cli.tasks.protocol import walls_of
+from cdiff_cli.training.demonstrations import demonstrations
 
 MAZES = [UMAZE, LARGE]
 each_maze = pytest.mark.parametrize("maze", MAZES, ids=lambda maze: maze.name)
@@ -38,7 +40,7 @@ def test_every_task_names_and_measures_its_coordinates(name):
     assert len(task.velocities) in (0, len(task.positions))
     assert {coordinate for group in task.shared_scale for coordinate in group} <= set(task.layout)
     assert task.dt > 0
-    assert task.walls().shape[1] == 4
+    assert walls_of(task).shape[1] == 4
 
 
 def test_an_unknown_task_is_answered_with_the_closest_and_with_all():
@@ -262,6 +264,6 @@ def test_exact_samples_have_the_covariance():
 
 def test_the_gaussian_is_neither_trained_nor_rolled_out():
     with pytest.raises(CdiffError, match="its score is exact"):
-        GAUSSIAN2D.demonstrate(10, 0)
+        demonstrations(GAUSSIAN2D, 10, 0)
     with pytest.raises(CdiffError, match="not an environment"):
         GAUSSIAN2D.make_env()

@@ -47,7 +47,7 @@ def levels_picture(
     axes = figure.subplots(rows, 1, squeeze=False)[:, 0]
     time = np.arange(levels.shape[1]) * task.dt
     for k, (axis, part) in enumerate(zip(axes, g.parts, strict=False)):
-        axis.plot(time, -done.foreseen[:, :, k].T, color=REFERENCE, lw=0.6)
+        axis.plot(time, -done.predicted_levels[:, :, k].T, color=REFERENCE, lw=0.6)
         axis.plot(time, -levels[:, :, k].T, color=RESULT, lw=0.7, alpha=0.8)
         axis.axhline(0, color=UNSAFE, lw=1.2)
         axis.set(xlabel="time / s", ylabel=f"h of {part.name}")

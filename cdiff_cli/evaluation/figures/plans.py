@@ -28,7 +28,7 @@ from cdiff_cli.evaluation.figures.style import (
     save,
     write_video,
 )
-from cdiff_cli.tasks.protocol import Task
+from cdiff_cli.tasks.protocol import Task, walls_of
 
 Extent = tuple[float, float, float, float]
 """Drawn part of the plane: x_min, x_max, y_min, y_max."""
@@ -159,7 +159,7 @@ def _in_plane(part: TrajectoryConstraint, task: Task) -> bool:
 
 
 def _draw_walls(axis: Any, task: Task) -> None:
-    for x0, y0, x1, y1 in task.walls():
+    for x0, y0, x1, y1 in walls_of(task):
         axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, color=WALL, lw=0, zorder=1))
 
 
@@ -198,7 +198,7 @@ def _draw_timed(axis: Any, paths: Array) -> None:
 
 def _extent(task: Task, g: Constraint, trajectories: Sequence[Array]) -> Extent:
     """The walls; without walls, the trajectories; without trajectories, the unsafe sets."""
-    walls = task.walls()
+    walls = walls_of(task)
     if len(walls):
         return walls[:, 0].min(), walls[:, 2].max(), walls[:, 1].min(), walls[:, 3].max()
     columns = position_columns(task)

@@ -7,13 +7,13 @@ by 6 mm within its own step. Ball and obstacle have radius 0.5 m: they touch at 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.tasks.ball_run.obstacles import PATTERNS, beside
-from cdiff_cli.tasks.protocol import Tolerances
+from cdiff_cli.tasks.protocol import Control, Tolerances
 
 DT = 4 / 120
 PUSH = 8.2  # m/s^2 a unit of force
@@ -38,11 +38,18 @@ class BallRun:
     velocities = ("vx", "vy")
     shared_scale = (("x", "y"), ("vx", "vy"))
     dt = DT
+    control: ClassVar[Control] = "receding_horizon"
     tolerances = Tolerances()
     actions = ("force_x", "force_y")
     invariant = ("x",)
-    env_options = {"pattern": PATTERNS, "collide": (True, False)}
+    env_options: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "pattern": tuple(PATTERNS),
+        "collide": (True, False),
+    }
     observable = ("obstacle.x", "obstacle.y", "obstacle.vx", "obstacle.vy")
+    relative_to: ClassVar[Mapping[str, str]] = {
+        name: name.removeprefix("obstacle.") for name in observable
+    }
 
     def make_env(
         self, render: bool = False, pattern: str | None = None, collide: bool = True
@@ -79,9 +86,6 @@ class BallRun:
     def brake(self, state: Array) -> Array:
         """Inputs that stop the ball as fast as they can: an eighth of a second of full force a m/s."""
         return np.clip(-state[2:], -1.0, 1.0)
-
-    def walls(self) -> Array:
-        return np.empty((0, 4))
 
     def from_d4rl(self, states: Array) -> Array:
         """Observations of SafetyBallRun as states."""

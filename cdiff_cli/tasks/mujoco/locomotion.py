@@ -8,14 +8,14 @@ import os
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.paths import home, shown
-from cdiff_cli.tasks.protocol import Tolerances
+from cdiff_cli.tasks.protocol import Control, Tolerances
 
 BRANCH_SHARE = 0.1  # of all demonstrated steps: random actions, without which the inverse dynamics knows only gaits
 BURST_EVERY = 100  # steps between bursts on average, in the walks that have them
@@ -69,9 +69,9 @@ class Locomotion:
     velocities: tuple[str, ...] = ()
     shared_scale: tuple[tuple[str, ...], ...] = ()
     invariant: tuple[str, ...] = ()
-    observable: tuple[str, ...] = ()
     max_steps: int = 1000
 
+    control: ClassVar[Control] = "receding_horizon"
     tolerances = Tolerances()
 
     def make_env(self, render: bool = False, **options: Any) -> Any:
@@ -98,16 +98,6 @@ class Locomotion:
     def observe(self, obs: Any) -> Array:
         """State of an observation, or states of a whole episode of observations."""
         return np.asarray(obs["observation"] if isinstance(obs, dict) else obs, dtype=np.float64)
-
-    def observed(self, env: Any) -> dict[str, float]:
-        return {}
-
-    def from_d4rl(self, states: Array) -> Array:
-        """D4RL's observations have this layout."""
-        return states
-
-    def walls(self) -> Array:
-        return np.empty((0, 4))
 
     # experts ----------------------------------------------------------------------------------------------------------
 

@@ -34,6 +34,7 @@ from cdiff_cli.models.networks import TemporalUnet
 from cdiff_cli.models.normaliser import ResidualNormaliser
 from cdiff_cli.planning.receding_horizon import Controller, control
 from cdiff_cli.projection.project import project
+from cdiff_cli.tasks.protocol import observable_of
 
 WARM_UP = 10
 METHODS = ("diffuser", "projected", "primal-dual", "alm")
@@ -67,7 +68,7 @@ def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controll
 def projections(acting: Controller) -> tuple[float, float, float]:
     """Milliseconds of one projection of a random plan near the data onto the first chain: ours, ProxQP's; their distance."""
     frame, dim = acting.frame, len(acting.task.layout)
-    seen = {name: torch.ones(1, dtype=torch.float64) for name in acting.task.observable}
+    seen = {name: torch.ones(1, dtype=torch.float64) for name in observable_of(acting.task)}
     generator = torch.Generator().manual_seed(0)
     present = frame.state.decode(torch.randn(1, dim, generator=generator, dtype=torch.float64))
     to = frame.at(present)

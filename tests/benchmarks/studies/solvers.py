@@ -61,7 +61,7 @@ def end(law, schedule, kernel):
         Pins.none(x),
         lambda: x,
         kernel=KERNELS[kernel],
-    )
+    ).x
 
 
 def kept(full, steps):
