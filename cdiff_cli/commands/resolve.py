@@ -272,14 +272,8 @@ def compile_constraints(
 ) -> tuple[Path, list[Kind], Constraint]:
     """The constraint file, its kinds, and the g(x) <= 0 they declare."""
     path = request.constraints or shown(home() / "constraints" / recipe.constraints)
-    observable = observable_of(task)
     kinds, declared = load_constraints(
-        path,
-        task.name,
-        task.layout,
-        loaded.planner.dynamics,
-        observable,
-        task.dt,
+        path, task.name, task.layout, loaded.planner.dynamics, observable_of(task), task.dt
     )
     limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
     if limited and task.control == "receding_horizon":
