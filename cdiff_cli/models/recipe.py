@@ -1,9 +1,10 @@
 """Recipes and cards: how a task's model is trained and sampled, and what a trained checkpoint says of itself."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails
 
 from cdiff_cli.models.preset import Count, Positive, Preset
 from cdiff_cli.paths import home, shown
@@ -147,15 +148,13 @@ class Recipe(Strict):
             return presets
         whole: dict[str, Any] = {}
         for name, preset in presets.items():
-            values = dict(preset) if isinstance(preset, dict) else preset
-            if isinstance(values, dict) and "like" in values:
-                base = values.pop("like")
-                if base not in whole:
-                    raise ValueError(
-                        f"{name}.like: expected a preset above it, found {base!r}; "
-                        f"above it are: {', '.join(whole) or 'none'}"
-                    )
-                values = merged(whole[base], values)
+            values = preset
+            if isinstance(preset, dict) and "like" in preset:
+                base, values = preset["like"], {k: v for k, v in preset.items() if k != "like"}
+                if not isinstance(base, str) or base not in whole:
+                    raise _no_such_base(name, base, whole)
+                if isinstance(whole[base], dict):
+                    values = merged(whole[base], values)
             whole[name] = values
         return whole
 
@@ -176,9 +175,22 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     values = dict(base)
     for name, value in over.items():
         below = values.get(name)
-        nested = isinstance(below, dict) and isinstance(value, dict)
-        values[name] = merged(dict(below or {}), value) if nested else value
+        if isinstance(below, dict) and isinstance(value, dict):
+            values[name] = merged(below, value)
+        else:
+            values[name] = value
     return values
+
+
+def _no_such_base(name: str, base: Any, above: Iterable[str]) -> ValidationError:
+    """The refusal of `like: base` in the preset `name`, at its own place in the file."""
+    complaint = ValueError(
+        f"expected a preset above it, found {base!r}; above it are: {', '.join(above) or 'none'}"
+    )
+    details = InitErrorDetails(
+        type="value_error", loc=(name, "like"), input=base, ctx={"error": complaint}
+    )
+    return ValidationError.from_exception_data("presets", [details])
 
 
 class Card(Strict):

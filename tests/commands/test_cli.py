@@ -67,7 +67,7 @@ def test_a_run_holds_every_artifact_of_the_interface(alm_run):
         assert plan["x"].dtype == np.float64
         assert list(plan["layout"]) == ["x", "y", "vx", "vy"]
     config = yaml.safe_load((run / "run.yaml").read_text())
-    assert config["method"]["alm"]["on"] == "clean"
+    assert config["preset"]["methods"]["alm"]["on"] == "clean"
     assert len(config["checkpoint"]["weights_sha256"]) == 64
 
 

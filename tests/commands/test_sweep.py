@@ -17,7 +17,7 @@ from cdiff_cli.commands.sweep import Matrix, Outcome, plan_sweep, progress_table
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.columns import COSTS
 from cdiff_cli.evaluation.comparison import newest
-from cdiff_cli.planning import receding_horizon
+from cdiff_cli.planning.receding_horizon import rollout as act
 from tests.commands.test_cli import cdiff
 
 ROOT = Path(__file__).parents[2]
@@ -176,14 +176,12 @@ def test_the_progress_table_counts(tmp_path):
 def test_a_diverged_episode_is_no_clean_cell_neither_when_made_nor_when_it_was_there(
     tmp_path, monkeypatch
 ):
-    control = receding_horizon.control
-
-    def spoilt(controller, seeds, *rest, **more):
+    def spoilt(controller, task, seeds, *rest, **more):
         """The plans of seed 1 are not finite after its first steps."""
-        done = control(controller, seeds, *rest, steps=3, **more)
+        done = act(controller, task, seeds, *rest, steps=3, **more)
         return replace(done, diverged=np.array([seed == 1 for seed in seeds]))
 
-    monkeypatch.setattr(rollout, "control", spoilt)
+    monkeypatch.setattr(rollout, "rollout", spoilt)
     words = (
         "sweep",
         "--task",

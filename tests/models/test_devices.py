@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import split
 from cdiff_cli.constraints.observed import Observed
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.spec.load import load_constraints
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.planning.problem import make_pins
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling import make_method
 from cdiff_cli.sampling.kernels import ddpm
@@ -54,15 +54,15 @@ def test_sampling_names_the_device_of_every_tensor(file, method):
         split(problem.enforced)[0], problem.normaliser.centre, problem.normaliser.scale
     ).to(torch.empty(0))
     pins, noise = (
-        make_pins(problem, 2, device=CPU),
-        normal(0, 5, 2, problem.horizon, 4, scale=0.5).float(),
+        problem.pins(2, device=CPU),
+        normal(0, 5, 2, problem.planner.horizon, 4, scale=0.5).float(),
     )
 
     def work():
         draws = iter(noise)
         return sample(
             lambda x, _: 0.9 * x,
-            problem.schedule,
+            problem.planner.schedule,
             asked.method,
             g,
             pins,
@@ -79,8 +79,8 @@ def test_the_last_projection_names_the_device_of_every_tensor(file, dynamics):
     problem = resolved(file, "alm").problem
     g = problem.enforced if dynamics else split(problem.enforced)[0]
     g = pull_back(g, problem.normaliser.centre, problem.normaliser.scale)
-    pins = make_pins(problem, 2, F64, CPU)
-    z = pins.paint(normal(1, 2, problem.horizon, 4, scale=0.3).cumsum(1) / 8)
+    pins = problem.pins(2, F64, CPU)
+    z = pins.paint(normal(1, 2, problem.planner.horizon, 4, scale=0.3).cumsum(1) / 8)
     twice(lambda: project(g, z, pins, strict=False))
 
 

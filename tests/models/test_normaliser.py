@@ -6,6 +6,7 @@ import torch
 
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.networks import ResidualMlp
+from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.training.inverse_dynamics import fit_inverse
 from cdiff_cli.training.windows import Windows, fit_residual_normaliser
@@ -105,3 +106,32 @@ def test_a_single_episode_is_fitted_to_and_none_is_held_out():
     x, u = episode(0, 40)
     _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), 0)
     assert explained == {}
+
+
+def test_limits_go_to_minus_one_and_one():
+    to = Normaliser.from_limits([-1.0, 0.0], (3.0, 10.0))
+    assert to.encode(torch.tensor([[-1.0, 0.0], [3.0, 10.0], [1.0, 5.0]], dtype=F64)).tolist() == [
+        [-1.0, -1.0],
+        [1.0, 1.0],
+        [0.0, 0.0],
+    ]
+    x = normal(0, 5, 2)
+    torch.testing.assert_close(to.decode(to.encode(x)), x)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([0.0, 1.0], [1.0, 1.0]),
+        ([0.0, 2.0], [1.0, 1.0]),
+        ([0.0], [1.0, 1.0]),
+        ([[0.0]], [[1.0]]),
+        (0.0, 1.0),
+        ([0.0, np.nan], [1.0, 1.0]),
+        ([-np.inf], [np.inf]),
+    ],
+    ids=str,
+)
+def test_limits_without_width_are_refused(low, high):
+    with pytest.raises(ValueError, match="expected low < high for every coordinate"):
+        Normaliser.from_limits(low, high)

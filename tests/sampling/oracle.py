@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,14 +28,17 @@ from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.normaliser import Normaliser
-from cdiff_cli.models.recipe import Preset, load_recipe
+from cdiff_cli.models.planner import Planner
+from cdiff_cli.models.preset import SamplerSettings
+from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.planning.open_loop import plan, polish_plans
+from cdiff_cli.planning.open_loop import plan
+from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import Problem
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling import METHODS, make_method
 from cdiff_cli.sampling.baselines import Unconstrained
-from cdiff_cli.sampling.sampler import Method, Step
+from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 Array = NDArray[np.float64]
 F64 = torch.float64
@@ -57,10 +60,6 @@ class Routes:
     std: Tensor
     weights: Tensor
     length: float = 0.4
-
-    # the seam to cdiff_cli.tasks: all that planning.plan asks of a task
-    layout = ("x", "y")
-    positions = ("x", "y")
 
     @property
     def horizon(self) -> int:
@@ -171,18 +170,8 @@ def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
     schedule = Schedule.cosine(n_steps)
     scale = Normaliser(torch.zeros(2, dtype=F64), torch.full((2,), SCALE, dtype=F64))
     start, goal = law.means[0, [0, -1]].numpy()
-    return Problem(
-        law,
-        law.horizon,
-        law.denoiser(schedule),
-        schedule,
-        scale,
-        g,
-        g,
-        start,
-        goal,
-        torch.device("cpu"),
-    )
+    planner = Planner(law.denoiser(schedule), schedule, scale, law.horizon, ("x", "y"))
+    return Problem(planner, declared=g, enforced=g, start=start, goal=goal)
 
 
 # what separates samples from the truth ------------------------------------------------------------------------------------
@@ -239,8 +228,17 @@ def measure(
 # variants of a method ---------------------------------------------------------------------------------------------------
 
 
+class Polished:
+    """What these variants say of themselves, as the methods of cdiff_cli.sampling do."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
+
+
 @dataclass(frozen=True)
-class Latent:
+class Latent(Polished):
     """A method on the clean estimate whose shift of it is carried to x_t as well, so that the noise estimate stays:
 
         x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0),   a, b = alpha_bar_t, alpha_bar_{t-1}
@@ -267,7 +265,7 @@ class Latent:
 
 
 @dataclass(frozen=True)
-class Over:
+class Over(Polished):
     """Projection of the clean estimate, overdone: x0' = x0 + fold (P(x0) - x0), the last one exact."""
 
     fold: float
@@ -281,7 +279,7 @@ class Over:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Asked(Polished):
     """Latent projection that asks the network about the shifted x_t before it goes on: two calls a step."""
 
     schedule: Schedule
@@ -299,7 +297,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Late:
+class Late(Polished):
     """A method that acts in the last `steps` of n_steps only; before them the sampler is left alone."""
 
     inner: Method
@@ -324,7 +322,7 @@ class Late:
 class Run:
     """One way to sample the constrained law.
 
-    preset   kernel, extra steps and polish, as in a recipe
+    sampler  kernel, extra steps and final projection; its `steps` are not used
     k        candidates a plan, of which the first that obeys is kept, else the one that violates least
     steps    steps of the respaced schedule, None for all
     repair   a plan of which no candidate obeys: its noise sampled again by this method, None: the polish alone
@@ -332,7 +330,7 @@ class Run:
 
     name: str
     method: Method
-    preset: Preset
+    sampler: SamplerSettings
     k: int = 1
     steps: int | None = None
     repair: Method | None = None
@@ -340,24 +338,23 @@ class Run:
 
 def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
     """Every method under every preset of a task's recipe; the unconstrained one, alike in all, once."""
-    runs = [Run("diffuser", Unconstrained(), Preset())]
+    runs = [Run("diffuser", Unconstrained(), SamplerSettings())]
     for label, preset in load_recipe(task).presets.items():
         for name in METHODS:
             if name not in (
                 "diffuser",
                 "conditional",
             ):  # the one is there, the other needs training
-                own = preset.model_copy(update={"extra_steps": preset.extra_steps_for(name)})
-                runs.append(
-                    Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), own)
-                )
+                own = preset.of_method(name)
+                method = make_method(name, own.methods[name])
+                runs.append(Run(f"{name} {label}", method, own.sampler))
     return runs
 
 
 def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
     """What `recommended` could be instead, all with its final polish."""
-    preset = load_recipe(task).presets["recommended"]
-    schedule, n_steps = at.schedule, at.schedule.n_steps
+    preset, schedule = load_recipe(task).presets["recommended"], at.planner.schedule
+    sampler, n_steps = preset.sampler, schedule.n_steps
     few = schedule.respaced(n_steps // 4)
     clean = {
         name: make_method(name, preset.methods[name])
@@ -368,28 +365,28 @@ def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
     plain = Unconstrained()
     return [
         *(
-            Run(f"latent {name}", Latent(method, schedule), preset)
+            Run(f"latent {name}", Latent(method, schedule), sampler)
             for name, method in clean.items()
         ),
-        Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), preset),
-        Run("latent projected, 2 calls", Asked(schedule, at.denoiser), preset),
-        Run("latent projected, last half", Latent(half, schedule), preset),
-        Run("projected, last half", half, preset),
-        Run("projected, final only", Late(projected, 1, n_steps), preset),
-        Run(f"best of 4, {few.n_steps} steps", plain, preset, k=4, steps=few.n_steps),
+        Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), sampler),
+        Run("latent projected, 2 calls", Asked(schedule, at.planner.denoiser), sampler),
+        Run("latent projected, last half", Latent(half, schedule), sampler),
+        Run("projected, last half", half, sampler),
+        Run("projected, final only", Late(projected, 1, n_steps), sampler),
+        Run(f"best of 4, {few.n_steps} steps", plain, sampler, k=4, steps=few.n_steps),
         Run(
             f"best of 4, {few.n_steps} steps, else latent",
             plain,
-            preset,
+            sampler,
             k=4,
             steps=few.n_steps,
             repair=Latent(projected, few),
         ),
-        Run(f"best of 4, {n_steps} steps", plain, preset, k=4),
+        Run(f"best of 4, {n_steps} steps", plain, sampler, k=4),
         Run(
             f"best of 4, {n_steps} steps, else latent",
             plain,
-            preset,
+            sampler,
             k=4,
             repair=Latent(projected, schedule),
         ),
@@ -403,18 +400,12 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
     def counted(z: Traj, t: int) -> Traj:
         nonlocal asked
         asked += len(z)
-        return at.denoiser(z, t)
+        return at.planner.denoiser(z, t)
 
-    here = replace(
-        at,
-        denoiser=counted,
-        schedule=at.schedule if run.steps is None else at.schedule.respaced(run.steps),
-    )
-    preset = run.preset
+    here = replace(at, planner=replace(at.planner, denoiser=counted).respaced(run.steps))
 
     def plans(method: Method, draws: Sequence[int]) -> Array:
-        kernel, extra = preset.kernel, preset.extra_steps
-        return plan(here, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish).x
+        return plan(here, method, draws, run.sampler).x
 
     if run.k == 1:
         x = plans(
@@ -425,8 +416,10 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
     draws = (
         np.array(seeds) + 10_000_000 * np.arange(run.k)[:, None]
     )  # [k, n], the first those of every other run
-    candidates = plans(run.method, draws.ravel().tolist()).reshape(run.k, len(seeds), at.horizon, 2)
-    worst = np.stack([metrics.worst_waypoint(at.g, x) for x in candidates]).clip(min=0)
+    candidates = plans(run.method, draws.ravel().tolist()).reshape(
+        run.k, len(seeds), at.planner.horizon, 2
+    )
+    worst = np.stack([metrics.worst_waypoint(at.declared, x) for x in candidates]).clip(min=0)
     best, each = worst.argmin(0), np.arange(len(seeds))
     x, bad = candidates[best, each], worst[best, each] > 0
     if bad.any() and run.repair is not None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.errors import CdiffError
@@ -81,7 +82,7 @@ def test_terminal_has_no_settings_and_records_none(setting):
         resolve(Request(task="gaussian2d", method="terminal", settings=(setting,)))
     resolved = resolve(Request(task="gaussian2d", method="terminal"))
     assert resolved.method == CleanProjected(correction="latent")
-    assert resolved.config()["method"] == {"terminal": {}}
+    assert resolved.record()["preset"]["methods"] == {"terminal": {}}
     assert resolved.row()["method"] == "terminal"
 
 
@@ -109,7 +110,7 @@ def test_best_of_one_is_the_unconstrained_plan(gaussian):
 
 
 def test_best_of_k_keeps_the_least_violation_of_its_candidates_and_counts_their_calls(gaussian):
-    tight = replace(gaussian.problem, enforced=gaussian.problem.g.tighten(3.0))
+    tight = replace(gaussian.problem, enforced=gaussian.problem.declared.tighten(3.0))
     best = plan(tight, BestOf(3), [0, 1, 2, 3])
     tries = [
         plan(tight, Unconstrained(), [candidate_seed(seed, j) for seed in range(4)])
@@ -128,7 +129,7 @@ def test_best_of_k_keeps_the_least_violation_of_its_candidates_and_counts_their_
 
 def test_best_of_k_keeps_the_seeds_own_plan_where_it_is_safe(gaussian):
     free = plan(gaussian.problem, Unconstrained(), gaussian.seeds).x
-    safe = (gaussian.problem.g(torch.from_numpy(free)) <= 0).all(1).numpy()
+    safe = (gaussian.problem.declared(torch.from_numpy(free)) <= 0).all(1).numpy()
     assert safe.sum() > 0
     np.testing.assert_array_equal(
         plan(gaussian.problem, BestOf(4), gaussian.seeds).x[safe], free[safe]

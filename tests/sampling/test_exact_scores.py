@@ -10,7 +10,7 @@ import torch
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.evaluation import metrics
-from cdiff_cli.models.recipe import Preset
+from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.sampling import load_kernel
 from cdiff_cli.sampling.clean_methods import CleanProjected
@@ -285,7 +285,9 @@ def test_runs_without_a_constraint_are_the_plain_sampler():
     at = problem(LAW, Constraint(()))
     free = execute(recipe_runs()[0], at, seeds(0, 10))[0]
     for run in (*recipe_runs(), *variant_runs(at)):
-        if run.k == 1 and run.preset.extra_steps == 0 and "2 calls" not in run.name:
+        if run.k == 1 and run.sampler.extra_steps == 0 and "2 calls" not in run.name:
             np.testing.assert_allclose(
-                execute(replace(run, preset=Preset()), at, seeds(0, 10))[0], free, atol=1e-6
+                execute(replace(run, sampler=SamplerSettings()), at, seeds(0, 10))[0],
+                free,
+                atol=1e-6,
             )

@@ -5,8 +5,9 @@ import shutil
 import pytest
 import torch
 
-from cdiff_cli.commands.plan import _plan_both
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.plan import plan_both
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
@@ -178,8 +179,8 @@ def test_a_base_of_another_network_or_other_data_is_refused(tmp_path):
 def test_the_shipped_planner_violates_less_than_the_unconditional_one_and_counts_both_calls():
     """Seeds 0-9, 64 steps: 0.004 of the violation was left; here four plans of 16 steps each."""
     resolved = resolve(Request(method="conditional", preset="paper", n=4, steps=16))
-    plans, free = _plan_both(resolved, lambda *_: None)
-    left, before = (violation(resolved.problem.g, each.x).sum() for each in (plans, free))
+    plans, free = plan_both(resolved, lambda *_: None)
+    left, before = (violation(resolved.declared, each.x).sum() for each in (plans, free))
     assert left < 0.6 * before
     assert plans.calls == 2 * free.calls
 
@@ -191,4 +192,4 @@ def test_constraints_edited_since_training_are_refused(tmp_path):
     with pytest.raises(CheckpointError, match="trained for other constraints than"):
         resolve(Request(method="conditional", constraints=file))
     file.write_text("# a comment\n" + text)
-    assert resolve(Request(method="conditional", constraints=file)).guided is not None
+    assert resolve(Request(method="conditional", constraints=file)).conditional is not None

@@ -12,14 +12,15 @@ from gymnasium.utils import seeding
 from typer.testing import CliRunner
 
 from cdiff_cli.cli import app
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.commands.run_directory import read_rows
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.denoiser import ObservationEncoder, guided
 from cdiff_cli.models.recipe import load_recipe
-from cdiff_cli.planning.receding_horizon import control
+from cdiff_cli.planning.receding_horizon import rollout
 from cdiff_cli.tasks.ball_run.env import DT, BallRunEnv
 from cdiff_cli.tasks.ball_run.obstacles import PATTERNS, beside
 from cdiff_cli.tasks.ball_run.task import BALL_RUN
@@ -264,9 +265,10 @@ def test_each_plan_is_told_what_is_observed_when_it_is_made():
 
     def spy(observed, present):
         told.append((present.clone(), torch.stack(tuple(observed.values()), 1)))
-        return acting.seeing(observed, present)
+        return acting.planner.conditioned_denoiser(observed, present)
 
-    done = control(replace(acting, seeing=spy), [0, 1], steps=3)
+    spied = replace(acting, planner=replace(acting.planner, conditioned_denoiser=spy))
+    done = rollout(spied, BALL_RUN, [0, 1], steps=3)
     assert len(told) == 3
     for step, (present, observed) in enumerate(told):
         np.testing.assert_array_equal(present.numpy(), done.x[:, step])

@@ -6,7 +6,8 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
@@ -359,8 +360,8 @@ def test_the_weight_of_the_recipe_counts_its_network_calls(weight, calls, whole,
         found = resolve(
             Request(task="ball-run", method=method, checkpoint=whole.path, device="cpu")
         )
-        assert found.conditions.returns == weight
-        assert found.config()["returns"] == weight
+        assert found.preset.sampler.return_weight == weight
+        assert found.record()["preset"]["sampler"]["return_weight"] == weight
         assert controller(found).calls == tries * calls
 
 
@@ -379,13 +380,13 @@ def test_plans_are_asked_for_the_most_by_every_method_and_preset(whole, asking):
                 task="ball-run", method=method, preset=preset, checkpoint=whole.path, device="cpu"
             )
         )
-        assert torch.equal(controller(found).denoiser(x, 5), wanted)
+        assert torch.equal(controller(found).planner.denoiser(x, 5), wanted)
 
 
 def test_a_checkpoint_that_knows_no_returns_is_asked_for_none(asking):
     asking(2.0)
     found = resolve(Request(task="ball-run", device="cpu"))
-    assert found.conditions.returns == 0.0
+    assert found.preset.sampler.return_weight == 0.0
     assert controller(found).calls == 20
 
 
@@ -394,4 +395,4 @@ def test_conditional_asks_for_what_obeys_and_not_for_returns(asking, whole):
     found = resolve(
         Request(task="ball-run", method="conditional", checkpoint=whole.path, device="cpu")
     )
-    assert found.conditions.returns == 0.0
+    assert found.preset.sampler.return_weight == 0.0

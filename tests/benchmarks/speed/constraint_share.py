@@ -10,7 +10,8 @@ import argparse
 import statistics
 from pathlib import Path
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.sampling import METHODS
 
@@ -42,12 +43,7 @@ for preset in arguments.presets.split(","):
         measured = []
         for _ in range(arguments.repeats + 1):
             plans = plan(
-                resolved.problem,
-                resolved.method,
-                resolved.seeds,
-                kernel=resolved.kernel,
-                extra_steps=resolved.conditions.extra_steps,
-                polish=resolved.preset.polish,
+                resolved.constrained, resolved.method, resolved.seeds, resolved.preset.sampler
             )
             outside = plans.total_s - plans.network_s
             measured.append(

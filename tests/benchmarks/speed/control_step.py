@@ -26,15 +26,17 @@ from rich.console import Console
 from rich.table import Table
 from scipy import sparse
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import pull_back
 from cdiff_cli.models.networks import TemporalUnet
 from cdiff_cli.models.normaliser import ResidualNormaliser
-from cdiff_cli.planning.receding_horizon import Controller, control
+from cdiff_cli.planning.receding_horizon import Controller, rollout
 from cdiff_cli.projection.project import project
-from cdiff_cli.tasks.protocol import observable_of
+from cdiff_cli.tasks import load_task
+from cdiff_cli.tasks.protocol import ControlTask, observable_of
 
 WARM_UP = 10
 METHODS = ("diffuser", "projected", "primal-dual", "alm")
@@ -52,7 +54,8 @@ def median_ms(call: Callable[[], Any], repeats: int = 200) -> float:
 
 def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controller:
     """The same with plans of that length, each estimate at the cost of a call of `net`."""
-    own, frame, shipped = acting.horizon, acting.frame, acting.denoiser
+    planner = acting.planner
+    own, frame, shipped = planner.horizon, planner.normaliser, planner.denoiser
     tau = torch.tensor([0, *(1 + k % (own - 1) for k in range(horizon - 1))])
 
     def denoiser(x: torch.Tensor, t: int) -> torch.Tensor:
@@ -62,23 +65,24 @@ def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controll
     longer = ResidualNormaliser(
         frame.state, frame.used, frame.mean[tau], frame.gain[tau], frame.scale[tau]
     )
-    return replace(acting, frame=longer, denoiser=denoiser)
+    planner = replace(planner, normaliser=longer, denoiser=denoiser, horizon=horizon)
+    return replace(acting, planner=planner)
 
 
-def projections(acting: Controller) -> tuple[float, float, float]:
+def projections(acting: Controller, task: ControlTask) -> tuple[float, float, float]:
     """Milliseconds of one projection of a random plan near the data onto the first chain: ours, ProxQP's; their distance."""
-    frame, dim = acting.frame, len(acting.task.layout)
-    seen = {name: torch.ones(1, dtype=torch.float64) for name in observable_of(acting.task)}
+    frame, dim, horizon = acting.planner.normaliser, len(task.layout), acting.planner.horizon
+    seen = {name: torch.ones(1, dtype=torch.float64) for name in observable_of(task)}
     generator = torch.Generator().manual_seed(0)
     present = frame.state.decode(torch.randn(1, dim, generator=generator, dtype=torch.float64))
     to = frame.at(present)
     g = pull_back(
-        acting.g.bind(seen, acting.task.dt, acting.horizon), to.centre, torch.ones_like(to.scale)
+        acting.declared.bind(seen, task.dt, horizon), to.centre, torch.ones_like(to.scale)
     )
     g = type(g)(g.parts[:1])
-    y = to.scale * torch.randn(1, acting.horizon, dim, generator=generator, dtype=torch.float64)
+    y = to.scale * torch.randn(1, horizon, dim, generator=generator, dtype=torch.float64)
     y[:, 0] = 0
-    mask = torch.zeros(acting.horizon, dim, dtype=torch.bool)
+    mask = torch.zeros(horizon, dim, dtype=torch.bool)
     mask[0] = True
     pins = Pins(mask, y)
     ours = project(g, y, pins, strict=False)
@@ -149,7 +153,8 @@ def main() -> None:
             title, justify="left" if title in ("task", "preset", "method") else "right"
         )
     for task in asked.task:
-        dim = len(resolve(Request(task=task)).problem.task.layout)
+        loaded = load_task(task)
+        dim = len(loaded.layout)
         net = (
             TemporalUnet(dim, 128, (1, 4, 8), ends=(0,)).eval().requires_grad_(False)
             if asked.paper_size
@@ -171,11 +176,11 @@ def main() -> None:
                 found: dict[str, list[Any]] = {m: [] for m in asked.methods}
                 for _ in range(asked.repeats):
                     for method, acting in sized.items():
-                        found[method].append(control(acting, [100], steps=asked.steps))
+                        found[method].append(rollout(acting, loaded, [100], steps=asked.steps))
                 name = f"{preset}, U-Net, horizon {horizon}" if horizon else preset
                 report(table, task, name, found)
         if not asked.paper_size:
-            ours, theirs, gap = projections(next(iter(each.values())))
+            ours, theirs, gap = projections(next(iter(each.values())), loaded)
             table.add_row(
                 task,
                 "",

@@ -15,7 +15,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.planning.open_loop import plan
@@ -76,8 +77,7 @@ for task in arguments.tasks.split(","):
                         problem,
                         resolved.method,
                         seeds,
-                        kernel=resolved.kernel,
-                        polish=resolved.preset.polish,
+                        resolved.preset.sampler,
                     )
                     measured.append(
                         (

@@ -8,7 +8,8 @@ import numpy as np
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.planning.episodes import Episodes
-from cdiff_cli.planning.receding_horizon import Controller, control
+from cdiff_cli.planning.receding_horizon import Controller, rollout
+from cdiff_cli.tasks.protocol import ControlTask
 
 
 class Acted(NamedTuple):
@@ -35,12 +36,13 @@ class Acted(NamedTuple):
 
 def act(
     controller: Controller,
+    task: ControlTask,
     seeds: Sequence[int],
     truth: Constraint,
     env: Mapping[str, Any] | None = None,
 ) -> Acted:
     """Episodes of all seeds together, scored by `truth`; inputs are bounded by 1 in every task."""
-    done = control(controller, seeds, env)
-    levels = metrics.executed_levels(truth, done.x, done.observed, controller.task.dt)
+    done = rollout(controller, task, seeds, env)
+    levels = metrics.executed_levels(truth, done.x, done.observed, task.dt)
     bounds = -np.ones(done.u.shape[2]), np.ones(done.u.shape[2])
     return Acted(done, levels, metrics.control_metrics(done, levels, bounds))

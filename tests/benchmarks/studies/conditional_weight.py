@@ -8,14 +8,14 @@ plans (torn or in a wall).
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from acting import act
 
-from cdiff_cli.commands.resolve import Experiment, Request, resolve
+from cdiff_cli.commands.experiment import Experiment, Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.planning.open_loop import plan
@@ -40,14 +40,13 @@ def told(values: np.ndarray) -> str:
 
 def planned(one: Experiment) -> list[str]:
     """Cells of whole plans."""
-    problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
     plans, free = (
-        plan(problem, one.method, one.seeds),
+        plan(one.constrained, one.method, one.seeds),
         plan(one.problem, Unconstrained(), one.seeds),
     )
-    g, checkpoint = problem.g, one.checkpoint
+    g, checkpoint = one.declared, one.checkpoint
     assert checkpoint is not None
-    rows = metrics.plan_metrics(problem.task, g, plans.x, free.x, one.recipe.paper_units)
+    rows = metrics.plan_metrics(one.task, g, plans.x, free.x, one.recipe.paper_units)
     violation, unbound = (metrics.violation(g, each.x) for each in (plans, free))
     torn = np.mean(
         [not metrics.smooth(row["jump"], checkpoint.card.data["jump_q999"]) for row in rows]
@@ -66,8 +65,8 @@ def planned(one: Experiment) -> list[str]:
 
 def acted(one: Experiment) -> list[str]:
     """Cells of episodes."""
-    env = {"collide": False} if one.options.task == "ball-run" else {}
-    found = act(controller(one), one.seeds, one.problem.g, env)
+    env = {"collide": False} if one.request.task == "ball-run" else {}
+    found = act(controller(one), one.task, one.seeds, one.declared, env)
     rate, over = (
         np.array([row[name] for row in found.rows])
         for name in ("violation_rate", "executed_violation")
@@ -101,8 +100,8 @@ def main() -> None:
     runs = {"diffuser": Request(method="diffuser", **common)}
     for weight in asked.weights.split(","):
         runs[weight] = Request(method="conditional", settings=(f"weight={weight}",), **common)
-    acts = resolve(runs["diffuser"]).acts
-    stem = resolve(runs["diffuser"]).constraints_path.stem
+    bare = resolve(runs["diffuser"])
+    acts, stem = bare.task.control == "receding_horizon", bare.constraints_path.stem
     print(
         f"{asked.task}, {stem}, preset paper, n = {asked.n}, seeds {asked.seed}-{asked.seed + asked.n - 1}\n"
     )

@@ -16,7 +16,8 @@ from acting import act
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.paths import home
 
@@ -76,7 +77,8 @@ def main() -> None:
         "saturation / %",
     ):
         table.add_column(title, justify="left" if title == "change" else "right")
-    truth = resolve(Request(task="ball-run")).problem.g
+    shipped = resolve(Request(task="ball-run"))
+    truth, plain = shipped.declared, shipped.preset.sampler.model_copy(update={"polish": False})
     for name, method, change, settings in ROWS:
         with tempfile.TemporaryDirectory() as folder:
             path = varied(change, Path(folder))
@@ -92,7 +94,8 @@ def main() -> None:
                 )
             )
         found = act(
-            replace(acting, polish=False) if "squared" in name else acting,
+            replace(acting, sampler=plain) if "squared" in name else acting,
+            shipped.task,
             seeds,
             truth,
             {"collide": False},

@@ -28,8 +28,9 @@ from rich.console import Console
 from rich.table import Table
 
 from cdiff_cli.commands.calibrate import fit_margins
-from cdiff_cli.commands.margins import Chosen, write_calibration
-from cdiff_cli.commands.resolve import Experiment, Request, resolve
+from cdiff_cli.commands.experiment import Experiment, Request
+from cdiff_cli.commands.margins import ChosenMargins, write_calibration
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation.conformal import tightened
 from cdiff_cli.paths import home
@@ -64,7 +65,7 @@ def fitted(options: Request, keep: bool) -> Experiment:
         write_calibration(calibrating.checkpoint.path, found)
     margins = {name: each.margin for name, each in found.margins.items()}
     problem = replace(resolved.problem, enforced=tightened(calibrating.problem.enforced, margins))
-    return replace(resolved, problem=problem, margins=Chosen(margins, "exact", found))
+    return replace(resolved, problem=problem, margins=ChosenMargins(margins, "exact", found))
 
 
 def approaches(h: Any) -> list[tuple[int, int]]:
@@ -153,8 +154,7 @@ def main() -> None:
         if not name.startswith(asked.only):
             continue
         resolved = fitted(options, asked.keep)
-        acting = controller(resolved)
-        found = act(acting, seeds, acting.g)
+        found = act(controller(resolved), resolved.task, seeds, resolved.declared)
         h = -found.levels.max(-1)
         fall = np.nanmax((h[:, :-1] - h[:, 1:]) / np.maximum(h[:, :-1], 0.05))
         rate, total = (
@@ -173,10 +173,16 @@ def main() -> None:
             f"{found.done.fell.sum()}",
         )
         if name.startswith("alpha"):
-            alpha = None if resolved.options.method == "diffuser" else float(name.split()[1])
+            alpha = None if resolved.request.method == "diffuser" else float(name.split()[1])
             margin = max(resolved.margins.margins.values(), default=0.0)
             draw(
-                axes, name.removeprefix("alpha: "), h, alpha, margin, acting.task.dt, next(colours)
+                axes,
+                name.removeprefix("alpha: "),
+                h,
+                alpha,
+                margin,
+                resolved.task.dt,
+                next(colours),
             )
         Console(stderr=True).print(name, margins, found.returned(), rate, found.worst())
     Console(width=130).print(table)

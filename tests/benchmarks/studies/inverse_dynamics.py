@@ -6,6 +6,7 @@ Ghost obstacle, all patterns; diffuser and recommended alm. The demonstrations a
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.arrays import Array
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.planning.receding_horizon import Controller
@@ -50,6 +53,20 @@ def linear(episodes: list, inputs: list):
     return inverse, np.sqrt((left**2).mean(0))
 
 
+def driven(
+    acting: Controller, inverse: Callable[[Tensor, Tensor], Tensor], ahead: int
+) -> Controller:
+    """The controller with another inverse dynamics model."""
+
+    def between(present: Array, following: Array) -> Array:
+        states = (torch.from_numpy(x).float() for x in (present, following))
+        with torch.inference_mode():
+            return inverse(*states).double().numpy()
+
+    planner = replace(acting.planner, inverse_dynamics=between)
+    return replace(acting, planner=planner, ahead=ahead)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--episodes", type=int, default=60)
@@ -57,8 +74,8 @@ def main() -> None:
     asked = parser.parse_args()
     torch.set_num_threads(1)
     both = {m: controller(resolve(Request(task=NAME, method=m))) for m in ("diffuser", "alm")}
-    recipe = resolve(Request(task=NAME)).recipe
-    task = both["alm"].task
+    shipped = resolve(Request(task=NAME))
+    recipe, task = shipped.recipe, shipped.task
     episodes = demonstrations(task, recipe.demonstrations.steps, recipe.demonstrations.seed)
     inputs = load_inputs(task, f"cdiff/{NAME}-v0")
     table = Table(
@@ -78,7 +95,11 @@ def main() -> None:
     def add(name: str, fits: tuple[str, str], changed: dict[str, Controller]) -> None:
         for method, acting in changed.items():
             found = act(
-                acting, range(asked.seed, asked.seed + asked.episodes), acting.g, {"collide": False}
+                acting,
+                task,
+                range(asked.seed, asked.seed + asked.episodes),
+                acting.declared,
+                {"collide": False},
             )
             table.add_row(
                 name,
@@ -96,10 +117,10 @@ def main() -> None:
         add(
             f"network, {ahead} ahead",
             told,
-            {m: replace(c, inverse=net, ahead=ahead) for m, c in both.items()},
+            {m: driven(c, net, ahead) for m, c in both.items()},
         )
     inverse, left = linear(episodes, inputs)
-    add("linear fit, 1 ahead", ("", ""), {m: replace(c, inverse=inverse) for m, c in both.items()})
+    add("linear fit, 1 ahead", ("", ""), {m: driven(c, inverse, 1) for m, c in both.items()})
     Console(width=120).print(table)
     Console(width=120).print(
         f"the linear fit leaves {', '.join(f'{v:.1e}' for v in left)} of x, y (m), vx, vy (m/s), root mean square"

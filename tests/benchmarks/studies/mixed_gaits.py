@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cdiff_cli.commands.calibrate import calibrate
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.checkpoint import install
 from cdiff_cli.models.recipe import Recipe, load_recipe
@@ -102,8 +103,9 @@ def main() -> None:
         )
         calibrate(resolve(replace(asking, n=100, seed=5000, calibrate=True)), lambda *_: None, 0.99)
         for method in ("diffuser", "alm"):
-            acting = controller(resolve(replace(asking, method=method)))
-            done = act(acting, range(asked.seed, asked.seed + asked.episodes), acting.g)
+            one = resolve(replace(asking, method=method))
+            seeds = range(asked.seed, asked.seed + asked.episodes)
+            done = act(controller(one), one.task, seeds, one.declared)
             reward = np.array([row["reward"] for row in done.rows])
             least, largest = f"{reward.min():.0f}", f"{reward.max():.0f}"
             counts = (

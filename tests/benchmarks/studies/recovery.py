@@ -10,18 +10,18 @@ many steps h stays below 0 for the first time, the most of any episode, the larg
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.evaluation.metrics import SAFE
-from cdiff_cli.planning.receding_horizon import control
+from cdiff_cli.planning.receding_horizon import rollout
 
 BEYOND = (0.5, 1.0, 2.0, 3.0, 5.0)
 STEPS, STRIDE = 300, 120  # after the push; the most steps of a stride
@@ -105,15 +105,15 @@ def recovered(
 ) -> list[str]:
     """Cells of one row."""
     planned = "diffuser" if method == EXPERT else method
-    acting = controller(resolve(Request(task=task, method=planned, n=1, device="cpu")))
-    pushing: Any = Pushing(acting.task, value, since, near)
+    one = resolve(Request(task=task, method=planned, n=1, device="cpu"))
+    pushing: Any = Pushing(one.task, value, since, near)
     steps = max(since) + STRIDE + STEPS
     x = (
         walked(pushing, seeds, steps)
         if method == EXPERT
-        else control(replace(acting, task=pushing), seeds, steps=steps).x
+        else rollout(controller(one), pushing, seeds, steps=steps).x
     )
-    f = metrics.executed_levels(acting.g, x, {}, acting.task.dt).max(-1)
+    f = metrics.executed_levels(one.declared, x, {}, one.task.dt).max(-1)
     after = np.stack(
         [
             row[env.at :][: STEPS + 1]

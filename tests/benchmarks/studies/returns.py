@@ -18,7 +18,8 @@ from acting import act
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.denoiser import calls_a_step, guided
 from cdiff_cli.paths import home
@@ -62,10 +63,11 @@ def main() -> None:
         assert checkpoint.card.returns is not None, "a checkpoint that knows no returns"
         for weight in asked.weights:
             denoiser = guided(checkpoint.net, weight, checkpoint.limit)
-            acting = replace(
-                controller(resolved), denoiser=denoiser, calls_a_step=calls_a_step(weight)
-            )
-            found = act(acting, seeds, acting.g)
+            acting = controller(resolved)
+            calls = calls_a_step(weight)
+            planner = replace(acting.planner, denoiser=denoiser, calls_per_step=calls)
+            acting = replace(acting, planner=planner)
+            found = act(acting, resolved.task, seeds, acting.declared)
             reward = np.array([row["reward"] for row in found.rows])
             returned = f"{reward.mean():.1f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.1f}"
             rate = f"{found.mean('violation_rate'):.3f}"
