@@ -290,7 +290,7 @@ class SinusoidalStep(nn.Module):
 
 
 class ConvBlock(nn.Sequential):
-    """Convolution of kernel 5, group normalisation, Mish: [batch, c_in, horizon] -> [batch, c_out, horizon]."""
+    """Kernel-5 convolution, group norm, Mish: [batch, c_in, horizon] -> [batch, c_out, horizon]."""
 
     def __init__(self, c_in: int, c_out: int) -> None:
         nn.Sequential.__init__(

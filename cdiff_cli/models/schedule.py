@@ -17,7 +17,7 @@ class Schedule:
 
     @classmethod
     def cosine(cls, n_steps: int) -> "Schedule":
-        """Cosine schedule with offset s = 0.008 and beta at most 0.999 (Nichol and Dhariwal, 2021)."""
+        """Cosine schedule, offset s = 0.008, beta at most 0.999 (Nichol and Dhariwal, 2021)."""
         level = [
             math.cos((i / n_steps + 0.008) / 1.008 * math.pi / 2) ** 2 for i in range(n_steps + 1)
         ]
