@@ -1,4 +1,4 @@
-"""The environments: a literal table from name to module."""
+"""The shipped tasks: a literal table from name to module."""
 
 import importlib
 
@@ -16,7 +16,7 @@ TASKS = {
 
 
 def load_task(name: str) -> Task:
-    """The task of that name; a CdiffError with a suggestion where there is none."""
+    """The task of that name; CdiffError with a suggestion if there is none."""
     if name not in TASKS:
         raise CdiffError(
             f'no task "{name}"{suggestion(name, TASKS)}; choose from {", ".join(TASKS)}'

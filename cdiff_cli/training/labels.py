@@ -57,6 +57,6 @@ class ConstraintLabel:
 
 
 def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Labels of which that share, drawn at random, is replaced by zeros, which mean no condition."""
+    """Labels, a random share of them replaced by zeros, which mean no condition."""
     keep = torch.rand(len(label), 1, generator=generator) >= share
     return label * keep
