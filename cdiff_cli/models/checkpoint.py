@@ -156,7 +156,7 @@ def load_checkpoint(
         card,
         path,
         dynamics,
-        ResidualNormaliser(normaliser, **parts["frame"]) if "frame" in parts else None,
+        ResidualNormaliser.from_record(normaliser, parts["frame"]) if "frame" in parts else None,
         _inverse(parts["inverse"], device) if "inverse" in parts else None,
         ObservationEncoder(**parts["telling"]) if "telling" in parts else None,
     )

@@ -10,7 +10,7 @@ from cdiff_cli.models.recipe import Preset, Recipe
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.sampling.kernels import KERNELS
+from cdiff_cli.sampling import KERNELS
 from cdiff_cli.yaml_files import load
 
 PRESETS = "presets:\n  fast:\n    kernel: dpm++2m\n    steps: 6\n    polish: true\n"

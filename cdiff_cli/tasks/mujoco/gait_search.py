@@ -1,4 +1,4 @@
-"""Augmented Random Search (Mania et al. 2018, V2-t) for linear gaits: python -m cdiff_cli.tasks.search hopper
+"""Augmented Random Search (Mania et al. 2018, V2-t) for linear gaits: python -m cdiff_cli.tasks.mujoco.gait_search hopper
 
 Each iteration tries the policy perturbed by +nu d and -nu d along N random directions d, keeps the b directions with the
 largest of their two returns, and steps by alpha / (b sigma) * sum (return+ - return-) d, sigma the standard deviation of
@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cdiff_cli.arrays import Array
+from cdiff_cli.errors import CdiffError
 from cdiff_cli.paths import home, shown
 from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.mujoco.locomotion import Gait, Locomotion
@@ -283,6 +284,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     asked = parser.parse_args(arguments)
     task, search = load_task(asked.task), SEARCHES[asked.task]
+    if not isinstance(task, Locomotion):
+        raise CdiffError(f"{task.name} has no gaits to search for")
     if asked.steps:
         search = search.within(asked.steps)
     out = asked.out or home() / "models" / task.name / "expert.json"

@@ -60,7 +60,7 @@ def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controll
         return shipped(x[:, :own], t)[:, tau]
 
     longer = ResidualNormaliser(
-        frame.state, frame.seen, frame.mean[tau], frame.gain[tau], frame.scale[tau]
+        frame.state, frame.used, frame.mean[tau], frame.gain[tau], frame.scale[tau]
     )
     return replace(acting, frame=longer, denoiser=denoiser)
 
