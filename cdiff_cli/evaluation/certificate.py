@@ -1,6 +1,7 @@
-"""What a run can promise: for each plan and constraint the worst value, where it is, and whether that settles the matter.
+"""Certificates of runs: the worst value of each plan and constraint, its place, and its status.
 
-Pure, from saved arrays, float64 and environment units. The tolerance is 0: a value above zero is unsafe, however small.
+A certificate is a pure function of saved arrays, float64 and in environment units. The tolerance
+is 0: every value above zero is unsafe.
 """
 
 import hashlib
@@ -21,21 +22,31 @@ from cdiff_cli.tasks.protocol import Task
 
 Entry = dict[str, Any]
 FORMAT = 1
-TIE = 1e-9  # values this close are a tie, and its first place is named: rounding must not choose among waypoints on a boundary
+TIE = 1e-9  # [units of g] values this close are equal, so that rounding does not choose the place
 SAFE = "safe"
 UNSAFE_AT_WAYPOINTS = "unsafe at waypoints"
 UNSAFE_BETWEEN = "unsafe between waypoints"
-UNKNOWN_BETWEEN = (
-    "unknown between waypoints"  # no value above zero was found there, and none is ruled out
-)
+UNKNOWN_BETWEEN = "unknown between waypoints"  # no known value above zero, and no exact maximum
 
 
 class Saved(NamedTuple):
-    """The trajectories of a .npz file: x [n, steps, dim], NaN after an episode's end; a seed each; the file's sha256."""
+    """Trajectories of a .npz file.
+
+    x        states, NaN after the end of an episode   [n, steps, dim]
+    seeds    one per trajectory                        [n]
+    sha256   hash of the file
+    """
 
     x: Array
     seeds: Sequence[int]
     sha256: str
+
+
+class Axes(NamedTuple):
+    """What naming a place in a plan takes: coordinates, and seconds between waypoints."""
+
+    layout: tuple[str, ...]
+    dt: float
 
 
 def certificate(
@@ -47,8 +58,10 @@ def certificate(
 ) -> Entry:
     """The certificate of a run, ready for JSON.
 
-    constraints   file and content as in run.yaml
-    g             the same content compiled, environment units
+    constraints   file and content, as in run.yaml
+    g             the content compiled, environment units
+    plan          the plans
+    rollout       the executed episodes, in the order of the plans
     """
     entries = _entries(task, g, plan, rollout)
     return {
@@ -67,25 +80,25 @@ def certificate(
 
 
 def content_sha256(content: Any) -> str:
-    """sha256 of the constraints themselves: of their JSON with sorted keys and no spaces."""
-    return hashlib.sha256(
-        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
+    """sha256 of the content of a constraint file: of its JSON with sorted keys and no spaces."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def summary(counts: Mapping[str, Any]) -> str:
-    """'10 of 10 plans safe at the waypoints, 9 of 10 between them', and how many stayed safe when executed."""
-    n = counts["plans"]
-    line = f"{counts['safe_at_waypoints']} of {n} plans safe at the waypoints, {counts['safe_on_segments']} of {n} between them"
-    return (
-        line
-        if counts["safe_executed"] is None
-        else f"{line}, {counts['safe_executed']} of {n} as executed"
-    )
+    """'10 of 10 plans safe at the waypoints, 9 of 10 between them', and as executed if known."""
+    n, executed = counts["plans"], counts["safe_executed"]
+    parts = [
+        f"{counts['safe_at_waypoints']} of {n} plans safe at the waypoints",
+        f"{counts['safe_on_segments']} of {n} between them",
+    ]
+    if executed is not None:
+        parts.append(f"{executed} of {n} as executed")
+    return ", ".join(parts)
 
 
-def _entries(task: "Task | Axes", g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
-    """An entry a plan and constraint, plan by plan."""
+def _entries(task: Task | Axes, g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
+    """One entry per plan and constraint, plan by plan."""
     by_part = [
         (
             part.name,
@@ -114,19 +127,16 @@ def _status(at: Entry, on: Entry) -> str:
         return UNSAFE_AT_WAYPOINTS
     if on["safe"]:
         return SAFE
-    return (
-        UNKNOWN_BETWEEN
-        if not on["exact"] and on["worst"] is not None and on["worst"] <= 0
-        else UNSAFE_BETWEEN
-    )
+    undecided = not on["exact"] and on["worst"] is not None and on["worst"] <= 0
+    return UNKNOWN_BETWEEN if undecided else UNSAFE_BETWEEN
 
 
 def _counts(entries: Sequence[Entry], n: int, parts: int, executed: bool) -> dict[str, int | None]:
-    def count(what: str) -> int:
-        return sum(
-            all(entry[what]["safe"] for entry in entries[i * parts : (i + 1) * parts])
-            for i in range(n)
-        )
+    """Numbers of plans that are safe under all constraints."""
+
+    def count(where: str) -> int:
+        plans = (entries[i * parts : (i + 1) * parts] for i in range(n))
+        return sum(all(entry[where]["safe"] for entry in plan) for plan in plans)
 
     return {
         "plans": n,
@@ -136,19 +146,20 @@ def _counts(entries: Sequence[Entry], n: int, parts: int, executed: bool) -> dic
     }
 
 
-def _at_waypoints(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> list[Entry]:
-    """The worst row of each plan: its label, the waypoint tau it judges (of a step, the one it leads to), the state there."""
+def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task | Axes) -> list[Entry]:
+    """The worst row of each plan: its value, label, waypoint tau and state.
+
+    The waypoint of a row on a step is the one that the step leads to.
+    """
     rows, labels = _values(part(_tensor(x))), part.labels(x.shape[1])
-    found = []
+    entries = []
     for i, values in enumerate(rows):
         row = _first_worst(values)
         label = None if row is None else labels[row]
-        tau = (
-            None
-            if row is None or label is None
-            else _waypoint(part, label, row, len(values), x.shape[1])
-        )
-        found.append(
+        tau = None
+        if row is not None and label is not None:
+            tau = _waypoint(part, label, row, len(values), x.shape[1])
+        entries.append(
             {
                 "worst": _largest(values),
                 "label": label,
@@ -158,30 +169,29 @@ def _at_waypoints(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> 
                 "safe": bool((values <= 0).all()),
             }
         )
-    return found
+    return entries
 
 
-def _on_segments(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> list[Entry]:
-    """The worst value on the straight segments between the waypoints of each plan, and the first point that has it.
+def _on_segments(part: TrajectoryConstraint, x: Array, task: Task | Axes) -> list[Entry]:
+    """The worst value on the segments between waypoints of each plan, and its first place.
 
-    A part over a level has the exact maximum (StateSet.segment_argmax), one that asks nothing between waypoints its own values, a rate is the
-    same all along a segment, whose beginning is named; of any other it is only what was found, and no promise.
+    The value is exact for a constraint over a state set (StateSet.segment_argmax), for one that
+    says nothing about segments, and for a rate limit: a rate is constant on a segment, and its
+    place is the start. For every other constraint it is a lower bound of the maximum.
     """
     level: StateSet | None = getattr(part, "level", None)
-    steady = isinstance(part, RateLimit)
-    exact = level is not None or steady or not part.spans
+    constant = isinstance(part, RateLimit)
+    exact = level is not None or constant or not part.spans
     rows = _values(part.segment_max(_tensor(x)))
-    at = [_first_worst(values) for values in rows]
-    if (level is None and not steady) or any(segment is None for segment in at):
+    segments = [_first_worst(values) for values in rows]
+    if (level is None and not constant) or any(segment is None for segment in segments):
         places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
     else:
-        plan, segment = np.arange(len(x)), np.array(at)
+        plan, segment = np.arange(len(x)), np.array(segments)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = (
-            np.zeros(len(x))
-            if level is None
-            else level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
-        )
+        share = np.zeros(len(x))
+        if level is not None:
+            share = level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}
@@ -195,14 +205,12 @@ def _on_segments(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> l
     ]
 
 
-def _executed(
-    part: TrajectoryConstraint, rollout: Saved | None, task: "Task | Axes"
-) -> list[Entry]:
+def _executed(part: TrajectoryConstraint, rollout: Saved | None, task: Task | Axes) -> list[Entry]:
     """The worst row over the executed states of each episode, up to its end."""
     if rollout is None:
         return []
     ends = np.isfinite(rollout.x).all(-1).sum(1)
-    alone = [_at_waypoints(part, rollout.x[i : i + 1, :end], task)[0] for i, end in enumerate(ends)]
+    worst = [_at_waypoints(part, rollout.x[i : i + 1, :end], task)[0] for i, end in enumerate(ends)]
     return [
         {
             "worst": e["worst"],
@@ -211,12 +219,15 @@ def _executed(
             "state": e["state"],
             "safe": e["safe"],
         }
-        for e in alone
+        for e in worst
     ]
 
 
 def _first_worst(values: Array) -> int | None:
-    """The first index of a value within TIE of the largest and on its side of zero, or of what is no number at all."""
+    """Index of the first NaN, else of the first value equal to the largest; None without values.
+
+    A value is equal to the largest if it lies within TIE and on the same side of zero.
+    """
     if len(values) == 0:
         return None
     if np.isnan(values).any():
@@ -228,7 +239,10 @@ def _first_worst(values: Array) -> int | None:
 def _waypoint(
     part: TrajectoryConstraint, label: str, row: int, rows: int, horizon: int
 ) -> int | None:
-    """The waypoint of a row by its label, name@tau or name@tau-tau'; None where the rows are not one a waypoint or step."""
+    """The waypoint of a row, from its label name@tau or name@tau-tau'.
+
+    None if there is not one row per waypoint or step.
+    """
     step = re.search(r"@\d+-(\d+)$", label)
     if step is not None:
         return int(step[1])
@@ -241,16 +255,16 @@ def _largest(values: Array) -> float | None:
 
 
 def _number(value: Any) -> float | None:
-    """A float for JSON, which knows no NaN and no inf."""
+    """A float for JSON; None for NaN and infinity, which JSON lacks."""
     return float(value) if math.isfinite(value) else None
 
 
-def _time(steps: Any, task: "Task | Axes") -> float:
-    """Seconds, to the nanosecond: 0.57, not 0.5700000000000001."""
+def _time(steps: Any, task: Task | Axes) -> float:
+    """Time [s], rounded to nanoseconds: 0.57, not 0.5700000000000001."""
     return round(float(steps) * task.dt, 9)
 
 
-def _state(task: "Task | Axes", point: Array) -> dict[str, float | None]:
+def _state(task: Task | Axes, point: Array) -> dict[str, float | None]:
     return {name: _number(value) for name, value in zip(task.layout, point, strict=True)}
 
 
@@ -260,13 +274,6 @@ def _tensor(x: Array) -> torch.Tensor:
 
 def _values(rows: torch.Tensor) -> Array:
     return np.asarray(rows.detach().numpy())
-
-
-class Axes(NamedTuple):
-    """What naming a place in a plan takes: coordinates, and seconds between waypoints."""
-
-    layout: tuple[str, ...]
-    dt: float
 
 
 def certify(g: Constraint, x: Array, axes: Axes) -> tuple[dict[str, int | None], list[Entry]]:

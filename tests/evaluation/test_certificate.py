@@ -1,4 +1,4 @@
-"""Certificates by hand: where a plan is worst, whether that is exact, and what it amounts to."""
+"""Certificates by hand: where a plan is worst, whether that is exact, and the status."""
 
 import json
 from types import SimpleNamespace
@@ -118,7 +118,10 @@ def test_a_tie_never_names_a_safe_waypoint_as_the_place_of_a_violation():
 
 
 def test_a_chain_is_judged_by_its_steps_and_between_waypoints_by_its_barrier():
-    """h = 1 - x with alpha 0.5: from h = 1 to 0.25 loses too much, yet h stays positive; the step leads to waypoint 1."""
+    """h = 1 - x and alpha 0.5: from h = 1 to 0.25 is too fast, although h stays positive.
+
+    The step leads to waypoint 1.
+    """
     (entry,) = certify(
         chain(HalfSpace(vec(1.0, 0.0), num(1.0)), 0.5), [[[0.0, 0.0], [0.75, 0.0], [0.75, 0.0]]]
     )["entries"]
@@ -168,7 +171,7 @@ def test_without_a_closed_form_nothing_is_promised_between_waypoints():
     }
 
 
-def test_rows_that_are_not_one_a_waypoint_have_a_label_but_no_place():
+def test_rows_that_are_not_one_per_waypoint_have_a_label_but_no_place():
     (entry,) = certify(opaque(lambda x: x.sum((1, 2))[:, None]), [[[0.0, 0.0], [0.5, 0.0]]])[
         "entries"
     ]

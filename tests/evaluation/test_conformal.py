@@ -1,4 +1,4 @@
-"""Margins: which errors count, the conformal quantile, what is tightened."""
+"""Margins: the errors that count, the conformal quantile, tightened constraints."""
 
 import math
 
@@ -33,18 +33,21 @@ def test_the_margin_is_the_largest_of_19_at_95_percent_and_the_18th_at_90():
 
 @given(st.integers(1, 60), st.floats(0.01, 0.99))
 def test_a_further_score_is_covered_as_often_as_promised(n, level):
-    """Of n + 1 exchangeable scores the last has each rank equally often: at most `rank` of n + 1 are covered, at least level."""
+    """The last of n + 1 exchangeable scores has every rank with equal probability.
+
+    So a score of rank r covers it with probability r / (n + 1).
+    """
     try:
-        found = conformal(np.arange(1.0, n + 1), level)
+        rank = conformal(np.arange(1.0, n + 1), level)
     except CdiffError as error:
-        need = int(str(error).split("it takes ")[1].split()[0])
-        assert need > n
-        require_enough(need, level)
+        enough = int(str(error).split("it takes ")[1].split()[0])
+        assert enough > n
+        require_enough(enough, level)
         with pytest.raises(CdiffError):
-            require_enough(need - 1, level)
+            require_enough(enough - 1, level)
     else:
-        assert level <= found / (n + 1) * (1 + 1e-12)  # the quotient is rounded
-        assert (found - 1) / (n + 1) < level * (1 + 1e-12)
+        assert level <= rank / (n + 1) * (1 + 1e-12)  # the quotient is rounded
+        assert (rank - 1) / (n + 1) < level * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -0.5, 2.0, math.nan])
@@ -56,10 +59,13 @@ def test_a_level_is_a_probability(level):
 
 
 def test_the_error_of_an_episode_is_the_worst_near_the_limit():
-    """f, unsafe above 0: an error of 0.5 planned 2 off the limit could make nothing unsafe, one of 0.2 at the limit can."""
-    foreseen = np.array([[np.nan, -2.0, 0.0, -0.3], [np.nan, -5.0, -0.1, np.nan]])[..., None]
+    """An error of 0.5 cannot make a state unsafe that is planned 2 from the limit.
+
+    An error of 0.2 can at the limit.
+    """
+    predicted = np.array([[np.nan, -2.0, 0.0, -0.3], [np.nan, -5.0, -0.1, np.nan]])[..., None]
     executed = np.array([[0.0, -1.5, 0.2, -0.4], [0.0, -5.0, -0.2, np.nan]])[..., None]
-    np.testing.assert_allclose(errors(foreseen, executed)[:, 0], [0.2, 0.0])
+    np.testing.assert_allclose(errors(predicted, executed)[:, 0], [0.2, 0.0])
 
 
 def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
@@ -72,26 +78,26 @@ def test_tightening_moves_the_limit_by_the_margin_of_that_name_alone():
 
 
 def test_margins_cover_the_errors_of_plans_that_keep_them():
-    """Errors of 0.1 without a margin and half a margin more with one: 0.1 itself would not do, the least that does is 0.2."""
-    asked = []
+    """The error is 0.1 plus half the margin, so 0.1 is not enough and 0.2 is the least margin."""
+    tried = []
 
     def measured(margins, number):
-        assert number == len(asked)
-        asked.append(margins)
+        assert number == len(tried)
+        tried.append(margins)
         return np.outer(np.linspace(0.5, 1.0, 20), 0.1 + 0.5 * margins)
 
     margins, scores, passes = until_covered(measured, 2, level=0.9)
     assert (scores <= margins).mean() >= 0.9
     assert np.allclose(margins, 0.2, atol=0.02)
-    assert passes == len(asked) > 1
-    assert np.array_equal(asked[0], np.zeros(2))
-    assert np.array_equal(asked[-1], margins)
+    assert passes == len(tried) > 1
+    assert np.array_equal(tried[0], np.zeros(2))
+    assert np.array_equal(tried[-1], margins)
 
 
 def test_margins_that_never_cover_what_they_cause_are_refused():
     with pytest.raises(
         CdiffError,
-        match=f"no margin found in {PASSES} passes: execution leaves the plans the further",
+        match=f"no margin found in {PASSES} passes: the larger the margin, the larger the error",
     ):
         until_covered(lambda margins, _: np.full((20, 1), 1.0) + 3 * margins, 1, level=0.9)
 
@@ -103,14 +109,16 @@ def test_where_execution_follows_the_plan_the_margin_is_nothing():
 
 
 def test_excess_counts_what_small_errors_add_up_to():
-    """Each step ends 0.01 less safe than its plan, and three in a row pass the limit by 0.02, with a margin of 0.1."""
+    """Each of three steps ends 0.01 less safe than planned, and the last is 0.02 past the limit."""
     executed = np.array([[[-0.2], [0.0], [0.01], [0.02]]])
-    foreseen = executed - 0.01
-    assert errors(foreseen, executed) == pytest.approx(0.01)
-    assert excess(foreseen, executed, np.array([0.1])) == pytest.approx(0.12)
+    predicted = executed - 0.01
+    assert errors(predicted, executed) == pytest.approx(0.01)
+    assert excess(predicted, executed, np.array([0.1])) == pytest.approx(0.12)
 
 
 def test_excess_of_a_safe_episode_is_its_error():
     executed = np.array([[[-0.2], [-0.05], [-0.02], [np.nan]]])
-    foreseen = np.array([[[-0.2], [-0.15], [-0.03], [np.nan]]])
-    assert excess(foreseen, executed, np.array([0.3])) == pytest.approx(errors(foreseen, executed))
+    predicted = np.array([[[-0.2], [-0.15], [-0.03], [np.nan]]])
+    assert excess(predicted, executed, np.array([0.3])) == pytest.approx(
+        errors(predicted, executed)
+    )
