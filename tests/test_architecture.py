@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "cdiff_cli"
 FILES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
-    {"arrays", "errors", "progress"},
+    {"arrays", "errors", "progress", "version"},
     {"yaml_files", "paths", "machine"},
     {"constraints"},
     {"projection", "models"},
@@ -21,6 +21,7 @@ LAYERS = [
     {"planning", "training"},
     {"evaluation"},
     {"commands"},
+    {"options"},
     {"cli"},
 ]
 """A folder or file imports from lower layers only; those of one layer do not import each other."""
@@ -116,7 +117,8 @@ def test_the_mathematics_knows_no_environment():
     [
         "cdiff_cli",
         "cdiff_cli.cli",
-        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
+        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory, cdiff_cli.commands.list_names",
+        "cdiff_cli.options, cdiff_cli.commands.names, cdiff_cli.commands.rerun",
         "cdiff_cli.evaluation.columns, cdiff_cli.evaluation.comparison, cdiff_cli.evaluation.statistics, cdiff_cli.evaluation.tables",
     ],
 )
