@@ -5,7 +5,6 @@ the package loads no torch and changes nothing in the host process.
 """
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from cdiff_cli.sampling import METHODS, make_method
     from cdiff_cli.tasks import load_task
     from cdiff_cli.tasks.protocol import Task
+
+__version__ = "0.1.0"
 
 PUBLIC = {
     "Certificate": "api",
@@ -67,11 +68,6 @@ __all__ = [*PUBLIC, "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        try:
-            return version("cdiff-cli")
-        except PackageNotFoundError:
-            return "0+unknown"
     if name not in PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = f"{__name__}.{PUBLIC[name]}"

@@ -23,8 +23,10 @@ from cdiff_cli.yaml_files import Document
 
 
 def check(file: Path, picture: Path, out: Console) -> None:
-    """Print the constraints of a file: rows, coordinates, units, projection, share of demonstrations that satisfy them; draw
-    them over those demonstrations.
+    """Print what the constraints of a file mean, and draw them over the demonstrations.
+
+    Per constraint: rows, coordinates with units, projection, share of demonstrations that
+    satisfy it.
     """
     document = Document(file)
     name = document.value.get("task") if isinstance(document.value, dict) else None
@@ -77,12 +79,14 @@ def check(file: Path, picture: Path, out: Console) -> None:
     fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
     if len(task.positions) != 2:
         out.print(
-            f"picture  none: the states of {name} have no place in the plane; `cdiff rollout` draws h over time"
+            f"picture  none: the states of {name} have no place in the plane; "
+            "`cdiff rollout` draws h over time"
         )
         return
     if not fixed.parts:
         out.print(
-            "picture  none: where these constraints lie is observed only while acting; `cdiff rollout` draws them"
+            "picture  none: where these constraints lie is observed only while acting; "
+            "`cdiff rollout` draws them"
         )
         return
     picture.parent.mkdir(parents=True, exist_ok=True)

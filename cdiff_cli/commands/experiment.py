@@ -109,6 +109,11 @@ class Experiment:
         return self.problem.declared
 
     @property
+    def replans(self) -> bool:
+        """Whether the task plans anew at every step."""
+        return self.task.control == "receding_horizon"
+
+    @property
     def seeds(self) -> list[int]:
         """One per plan or episode."""
         return list(range(self.request.seed, self.request.seed + self.request.n))

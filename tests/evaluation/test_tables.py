@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from cdiff_cli.evaluation.columns import COLUMNS, CONTROL_TABLE, KEYS, PAPER_TABLE
+from cdiff_cli.evaluation.columns import COLUMNS, CONTROL_TABLE, FORMATS, KEYS, PAPER_TABLE
 from cdiff_cli.evaluation.comparison import compare
-from cdiff_cli.evaluation.tables import FORMATS, header_and_lines, notes, read_paper, render
+from cdiff_cli.evaluation.tables import notes, read_paper, render
 
 METRICS = ("distance_paper", "violation_paper", "steps")
 ROWS = [

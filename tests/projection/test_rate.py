@@ -9,7 +9,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.load import json_schema, load_constraints
