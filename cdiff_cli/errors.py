@@ -1,15 +1,18 @@
-"""What goes wrong and is the user's to mend. Everything else is a bug and keeps its traceback."""
+"""Errors that the user can mend. Every other exception is a bug and keeps its traceback."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class CdiffError(Exception):
-    """Bad input: the message says what was found, what was expected, what to do. The command line exits with 2."""
+    """Bad input; the message says what was found, what was expected and what to do.
+
+    The command line prints it and exits with status 2.
+    """
 
 
 class SpecError(CdiffError):
-    """A YAML file that does not say what it should; the message begins with file, line and field."""
+    """A bad YAML file; the message begins with file, line and field."""
 
 
 class InfeasibleError(CdiffError):
@@ -17,10 +20,10 @@ class InfeasibleError(CdiffError):
 
 
 class CheckpointError(CdiffError):
-    """A checkpoint that is missing, damaged, or of another task."""
+    """A checkpoint that is missing, damaged, or made for another task."""
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """' (did you mean "x"?)' for the closest known name, or nothing."""
-    close = difflib.get_close_matches(name, list(known), 1, 0.5)
+    """' (did you mean "x"?)' for the closest known name; empty if none is close."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f' (did you mean "{close[0]}"?)' if close else ""

@@ -1,4 +1,4 @@
-"""Where models and constraints are, and how paths are shown."""
+"""Where models/ and constraints/ are, and how paths are shown."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ from cdiff_cli.errors import CdiffError
 
 
 def home() -> Path:
-    """Where models/ and constraints/ are: the working directory if it has them, else the checkout, else the package."""
+    """The folder with models/ and constraints/: working directory, else checkout, else package."""
     package = Path(__file__).parent
     for place in (Path.cwd(), package.parent, package / "shipped"):
         if (place / "models").is_dir() and (place / "constraints").is_dir():
@@ -18,9 +18,6 @@ def home() -> Path:
 
 
 def shown(path: Path) -> Path:
-    """The path relative to the working directory where it lies below it."""
-    return (
-        Path(os.path.relpath(path))
-        if path.is_absolute() and path.is_relative_to(Path.cwd())
-        else path
-    )
+    """The path relative to the working directory if it lies below it, else as it is."""
+    below = path.is_absolute() and path.is_relative_to(Path.cwd())
+    return Path(os.path.relpath(path)) if below else path

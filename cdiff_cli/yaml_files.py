@@ -1,4 +1,4 @@
-"""YAML files into pydantic models, with errors that name file, line and field."""
+"""Reads YAML files into pydantic models; every error names file, line and field."""
 
 import re
 from collections.abc import Sequence
@@ -14,7 +14,11 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Strict(BaseModel):
-    """Base of all models read from YAML: immutable, no unknown fields, no NaN or inf, no silent conversions of type."""
+    """Base of all models that are read from YAML.
+
+    Models are immutable. Unknown fields, NaN and infinity are errors, and so is a value of another
+    type.
+    """
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True
@@ -22,7 +26,10 @@ class Strict(BaseModel):
 
 
 class Loader(yaml.SafeLoader):
-    """SafeLoader with the booleans and floats of YAML 1.2: `on: clean` has the key "on", and 1e-3 is a number."""
+    """SafeLoader with the booleans and floats of YAML 1.2.
+
+    `on: clean` has the key "on", and 1e-3 is a number.
+    """
 
 
 Loader.yaml_implicit_resolvers = {
@@ -36,7 +43,10 @@ Loader.yaml_implicit_resolvers = {
 
 
 class Dumper(yaml.SafeDumper):
-    """SafeDumper that also quotes the texts that Loader takes for numbers: a constraint may be named "1e3"."""
+    """SafeDumper that quotes every text that Loader reads as a number.
+
+    A constraint may be named "1e3".
+    """
 
 
 for _yaml in (Loader, Dumper):
@@ -48,7 +58,12 @@ for _yaml in (Loader, Dumper):
 
 
 class Document:
-    """A parsed YAML file that still knows the line of each value."""
+    """A parsed YAML file with the line of each value.
+
+    path    the file
+    value   its content
+    node    its syntax tree, which has the lines
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -68,27 +83,27 @@ class Document:
             line = f":{mark.line + 1}" if mark else ""
             problem = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise SpecError(f"{path}{line}: not valid YAML: {problem}") from None
-        except (
-            ValueError,
-            RecursionError,
-        ) as error:  # an impossible date, an alias that contains itself
+        except (ValueError, RecursionError) as error:
+            # ValueError: an impossible date; RecursionError: an alias that contains itself
             raise SpecError(f"{path}: not valid YAML: {error}") from None
         if node is None:
             raise SpecError(f"{path}: the file is empty")
         self.node: yaml.Node = node
 
     def line(self, location: Sequence[str | int]) -> int:
-        """Line of the value at that location, or of the closest thing around it that exists."""
+        """Line of the value at a location; if there is none, the line of what contains it.
+
+        location   keys and list indices from the top, as in pydantic errors
+        """
         node = self.node
         for step in location:
             child = _child(node, step)
-            node = (
-                child if child is not None else node
-            )  # pydantic puts the union's tag in the path: no such node
+            if child is not None:  # a union's tag is in the path of pydantic, not in the file
+                node = child
         return int(node.start_mark.line) + 1
 
     def error(self, location: Sequence[str | int], message: str) -> SpecError:
-        """A SpecError at that location."""
+        """A SpecError whose message begins with file, line and field of a location."""
         shown, node = "", self.node
         for step in location:
             child = _child(node, step)
@@ -102,6 +117,7 @@ class Document:
         return SpecError(f"{where} {shown}: {message}" if shown else f"{where}: {message}")
 
     def read(self, model: type[M]) -> M:
+        """The validated content; raises SpecError."""
         try:
             return model.model_validate(self.value)
         except ValidationError as error:
@@ -110,13 +126,12 @@ class Document:
 
     def _refuse_duplicates(self, node: yaml.Node | None) -> None:
         if isinstance(node, yaml.MappingNode):
-            seen: set[str] = set()
+            keys: set[str] = set()
             for key, value in node.value:
-                if key.value in seen:
-                    raise SpecError(
-                        f'{self.path}:{key.start_mark.line + 1}: "{key.value}" stands twice; keep one'
-                    )
-                seen.add(key.value)
+                if key.value in keys:
+                    where = f"{self.path}:{key.start_mark.line + 1}"
+                    raise SpecError(f'{where}: "{key.value}" stands twice; keep one')
+                keys.add(key.value)
                 self._refuse_duplicates(value)
         elif isinstance(node, yaml.SequenceNode):
             for value in node.value:
@@ -143,8 +158,8 @@ def _is_tag(node: yaml.Node, step: str) -> bool:
 
 
 def _explain(error: dict[str, Any]) -> str:
-    """What was found, what was expected."""
-    found, kind, context = error.get("input"), error["type"], error.get("ctx", {})
+    """What was found and what was expected, from an error of pydantic."""
+    kind, context = error["type"], error.get("ctx", {})
     if kind == "missing":
         return "this field is missing"
     if kind == "extra_forbidden":
@@ -154,11 +169,11 @@ def _explain(error: dict[str, Any]) -> str:
         names = known.replace("'", "").split(", ")
         return f'no kind "{tag}"{suggestion(tag, names)}; expected one of {known}'
     if kind == "union_tag_not_found":
-        return "it has no kind; add `kind: linear`, `quadratic`, `dcbf` or `dynamics`"
+        return "it has no kind; add `kind: linear` or another"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
-    return f"{message}, found {_short(found)}"
+    return f"{message}, found {_short(error.get('input'))}"
 
 
 def _short(value: Any) -> str:
@@ -167,10 +182,8 @@ def _short(value: Any) -> str:
 
 
 def _near(path: Path) -> str:
-    """The YAML files that do exist beside a missing one."""
-    there = sorted(p.name for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
-    return (
-        f"; {path.parent} has {', '.join(there)}"
-        if there
-        else f"; {path.parent} holds no YAML file"
-    )
+    """The YAML files in the folder of a missing one."""
+    names = sorted(p.name for p in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+    if names:
+        return f"; {path.parent} has {', '.join(names)}"
+    return f"; {path.parent} has no YAML file"

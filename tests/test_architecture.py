@@ -116,7 +116,9 @@ def test_the_mathematics_knows_no_environment():
     [
         "cdiff_cli",
         "cdiff_cli.cli",
+        "cdiff_cli.sampling",
         "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
+        "cdiff_cli.yaml_files, cdiff_cli.paths, cdiff_cli.machine",
         "cdiff_cli.evaluation.columns, cdiff_cli.evaluation.comparison, cdiff_cli.evaluation.statistics, cdiff_cli.evaluation.tables",
     ],
 )

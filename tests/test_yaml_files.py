@@ -144,7 +144,7 @@ def test_a_missing_file_in_a_missing_folder_says_so(tmp_path):
     folder = tmp_path / "none"
     assert (
         message(folder / "leg.yaml")
-        == f"{folder / 'leg.yaml'}: no such file; {folder} holds no YAML file"
+        == f"{folder / 'leg.yaml'}: no such file; {folder} has no YAML file"
     )
 
 

@@ -19,7 +19,7 @@ from cdiff_cli.evaluation.certificate import Saved, certificate, summary
 from cdiff_cli.evaluation.columns import Row
 from cdiff_cli.evaluation.figures import plans as plan_figures
 from cdiff_cli.planning.open_loop import Plans, plan
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.tasks.protocol import HasExactScore
 
 Tick = Callable[[str, int, int], None]

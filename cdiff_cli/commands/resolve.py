@@ -27,8 +27,7 @@ from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home, shown
 from cdiff_cli.planning.problem import Problem, check_feasible
 from cdiff_cli.planning.start_goal import parse_state, random_pairs
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import METHODS, make_method, settings_of
+from cdiff_cli.sampling import KERNELS, METHODS, complete_settings, make_method
 from cdiff_cli.sampling.sampler import Method
 from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.protocol import HasExactScore, HasRoutes, Task, observable_of
@@ -213,7 +212,8 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
     """The preset with the options applied, the recipe's own, and the method."""
     own = recipe.presets[request.preset].of_method(request.method)
     constants = own.methods[request.method]
-    method = make_method(request.method, {**constants, **parse_settings(request.settings)})
+    chosen = {**constants, **parse_settings(request.settings)}
+    method = make_method(request.method, chosen)
     trained = loaded.planner.schedule.n_steps
     steps = own.sampler.steps if request.steps is None else request.steps
     if steps is not None and not 1 <= steps <= trained:
@@ -233,9 +233,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
             if method.planner == "conditional"
             else loaded.return_weight,
             "control.env": tuple(sorted(request.env or own.control.env)),
-            "methods": {
-                request.method: settings_of(request.method, make_method(request.method, constants))
-            },
+            "methods": {request.method: complete_settings(request.method, constants)},
         }
     )
     options = {
@@ -246,7 +244,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
         "control.warm_start": request.warm,
         "control.action_noise": request.action_noise or None,
         "enforce.dynamics": False if request.no_dynamics else None,
-        "methods": {request.method: settings_of(request.method, method)},
+        "methods": {request.method: complete_settings(request.method, chosen)},
     }
     return (
         resolved.updated({name: value for name, value in options.items() if value is not None}),
@@ -274,14 +272,8 @@ def compile_constraints(
 ) -> tuple[Path, list[Kind], Constraint]:
     """The constraint file, its kinds, and the g(x) <= 0 they declare."""
     path = request.constraints or shown(home() / "constraints" / recipe.constraints)
-    observable = observable_of(task)
     kinds, declared = load_constraints(
-        path,
-        task.name,
-        task.layout,
-        loaded.planner.dynamics,
-        observable,
-        task.dt,
+        path, task.name, task.layout, loaded.planner.dynamics, observable_of(task), task.dt
     )
     limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
     if limited and task.control == "receding_horizon":

@@ -25,7 +25,7 @@ from cdiff_cli.commands.run_directory import find_rows, read_rows
 from cdiff_cli.errors import CdiffError, suggestion
 from cdiff_cli.evaluation.columns import Row
 from cdiff_cli.models.recipe import load_recipe
-from cdiff_cli.sampling.methods import METHODS
+from cdiff_cli.sampling import METHODS
 from cdiff_cli.tasks import load_task
 
 BACKENDS = ("local", "ray", "dask")

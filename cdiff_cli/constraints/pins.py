@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cdiff_cli.arrays import Traj
+from cdiff_cli.arrays import Array, Traj
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,12 @@ class Pins:
         return cls(torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device), like)
 
     @classmethod
-    def ends(cls, x: Traj) -> "Pins":
-        """The first and the last state of each trajectory are fixed at their values in x."""
+    def ends(cls, x: Traj | Array) -> "Pins":
+        """The first and the last state of each trajectory are fixed at their values in x.
+
+        x   [batch, horizon, dim], numpy or torch
+        """
+        x = torch.as_tensor(x)
         mask = torch.zeros(x.shape[1:], dtype=torch.bool, device=x.device)
         mask[[0, -1]] = True
         return cls(mask, x)

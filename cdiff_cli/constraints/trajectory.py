@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cdiff_cli.arrays import Pull, Rows, Traj
+from cdiff_cli.arrays import Array, Pull, Rows, Traj
 from cdiff_cli.constraints.affine_rows import AffineRows
 
 
@@ -156,14 +156,20 @@ class Constraint:
             else x.new_empty((*x.shape[:2], 0))
         )
 
-    def worst(self, x: Traj) -> Float[Tensor, "batch"]:  # noqa: F821
-        """The largest g of each trajectory, at its waypoints and between them; -inf where g has no rows.
+    def worst(self, x: Traj | Array) -> Array:
+        """The largest g of each trajectory, at its waypoints and between them [batch].
 
-        Between waypoints a barrier counts by its value -h, and a black box by its rows alone.
+        -inf without rows. Between waypoints a barrier counts by its value -h, and a black box by
+        its rows alone.
+
+        x   [batch, horizon, dim], numpy or torch
         """
-        rows = [values for part in self.parts for values in (part(x), part.segment_max(x))]
-        lowest = x.new_full((len(x), 1), -torch.inf)
-        return torch.cat([lowest, *rows], 1).amax(1)
+        states = torch.as_tensor(x)
+        rows = [
+            values for part in self.parts for values in (part(states), part.segment_max(states))
+        ]
+        lowest = states.new_full((len(states), 1), -torch.inf)
+        return torch.cat([lowest, *rows], 1).amax(1).numpy(force=True)
 
     def on_segments(self) -> "Constraint":
         """The constraint that holds all along the segments, as far as the form of each part allows."""

@@ -84,7 +84,7 @@ def summary(counts: Mapping[str, Any]) -> str:
     )
 
 
-def _entries(task: Task, g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
+def _entries(task: "Task | Axes", g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
     """An entry a plan and constraint, plan by plan."""
     by_part = [
         (
@@ -136,7 +136,7 @@ def _counts(entries: Sequence[Entry], n: int, parts: int, executed: bool) -> dic
     }
 
 
-def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
+def _at_waypoints(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> list[Entry]:
     """The worst row of each plan: its label, the waypoint tau it judges (of a step, the one it leads to), the state there."""
     rows, labels = _values(part(_tensor(x))), part.labels(x.shape[1])
     found = []
@@ -161,7 +161,7 @@ def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entr
     return found
 
 
-def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
+def _on_segments(part: TrajectoryConstraint, x: Array, task: "Task | Axes") -> list[Entry]:
     """The worst value on the straight segments between the waypoints of each plan, and the first point that has it.
 
     A part over a level has the exact maximum (StateSet.segment_argmax), one that asks nothing between waypoints its own values, a rate is the
@@ -195,7 +195,9 @@ def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry
     ]
 
 
-def _executed(part: TrajectoryConstraint, rollout: Saved | None, task: Task) -> list[Entry]:
+def _executed(
+    part: TrajectoryConstraint, rollout: Saved | None, task: "Task | Axes"
+) -> list[Entry]:
     """The worst row over the executed states of each episode, up to its end."""
     if rollout is None:
         return []
@@ -243,12 +245,12 @@ def _number(value: Any) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _time(steps: Any, task: Task) -> float:
+def _time(steps: Any, task: "Task | Axes") -> float:
     """Seconds, to the nanosecond: 0.57, not 0.5700000000000001."""
     return round(float(steps) * task.dt, 9)
 
 
-def _state(task: Task, point: Array) -> dict[str, float | None]:
+def _state(task: "Task | Axes", point: Array) -> dict[str, float | None]:
     return {name: _number(value) for name, value in zip(task.layout, point, strict=True)}
 
 
@@ -258,3 +260,16 @@ def _tensor(x: Array) -> torch.Tensor:
 
 def _values(rows: torch.Tensor) -> Array:
     return np.asarray(rows.detach().numpy())
+
+
+class Axes(NamedTuple):
+    """What naming a place in a plan takes: coordinates, and seconds between waypoints."""
+
+    layout: tuple[str, ...]
+    dt: float
+
+
+def certify(g: Constraint, x: Array, axes: Axes) -> tuple[dict[str, int | None], list[Entry]]:
+    """Counts and entries of trajectories x [n, horizon, dim] that no run directory holds."""
+    entries = _entries(axes, g, Saved(x, range(len(x)), ""), None)
+    return _counts(entries, len(x), len(g.parts), executed=False), entries

@@ -1,6 +1,7 @@
-"""Normalisers: environment units to the network's, and back.
+"""Normalisers: affine maps between environment units and those of a network.
 
-A plain one is affine by coordinate. A residual one sees a window relative to a linear prediction from its first state.
+Normaliser maps each coordinate by itself. ResidualNormaliser maps a window relative to a linear
+prediction from its first state.
 """
 
 from collections.abc import Sequence
@@ -13,12 +14,14 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Array
 
-LEAST = 1e-6
+LEAST = 1e-6  # scale of a coordinate that is constant
 
 
 @dataclass(frozen=True)
 class Normaliser:
-    """x = centre + scale * z, coordinate by coordinate; coordinates of one group share a scale, so a ball stays a ball.
+    """x = centre + scale * z, coordinate by coordinate.
+
+    Coordinates of one group share a scale, so that a ball stays a ball.
 
     centre, scale   environment units   [dim]
     """
@@ -30,9 +33,12 @@ class Normaliser:
     def fit(
         cls, states: Array, layout: Sequence[str], shared: Sequence[Sequence[str]]
     ) -> "Normaliser":
-        """Limits of the data [n, dim] to [-1, 1]; the widest coordinate of a shared group sets the group's scale."""
+        """Maps the limits of the data [n, dim] to [-1, 1].
+
+        The widest coordinate of a shared group sets the scale of the group.
+        """
         low, high = states.min(0), states.max(0)
-        half = np.maximum((high - low) / 2, 1e-6)
+        half = np.maximum((high - low) / 2, LEAST)
         for group in shared:
             columns = [layout.index(name) for name in group]
             half[columns] = half[columns].max()
@@ -40,6 +46,7 @@ class Normaliser:
 
     @classmethod
     def identity(cls, dim: int) -> "Normaliser":
+        """x = z."""
         return cls(torch.zeros(dim, dtype=torch.float64), torch.ones(dim, dtype=torch.float64))
 
     @classmethod
@@ -61,43 +68,59 @@ class Normaliser:
         return Normaliser(self.centre[None, None], self.scale[None])
 
     def encode(self, x: Tensor) -> Tensor:
+        """z of x [..., dim]."""
         return (x - self.centre.to(x)) / self.scale.to(x)
 
     def decode(self, z: Tensor) -> Tensor:
+        """x of z [..., dim]."""
         return self.centre.to(z) + self.scale.to(z) * z
 
 
 @dataclass(frozen=True)
 class ResidualNormaliser:
-    """x^0 = state.centre + state.scale z^0,  x^k = x^0 + mean^k + gain^k z^0 + scale^k z^k for k > 0.
+    """A map of windows relative to a linear prediction from their first state.
 
-    The first row of z is the present state, which the network is told and never has to guess; the others say how the window
-    goes on from there, beyond what a linear regression on the present state foresees, all of them of size one.
+    x^0 = state.centre + state.scale z^0
+    x^k = x^0 + mean^k + gain^k z^0 + scale^k z^k   for k > 0
 
-    state         of the present state; coordinates that are not `seen` are told as 0   [dim]
-    seen          False for coordinates that nothing depends on                          [dim]
-    mean, gain    least squares of x^k - x^0 over the data's windows, environment units  [horizon, dim], [horizon, dim, dim]
-    scale         standard deviation of what they leave                                  [horizon, dim]
+    The first row of z is the present state, which the network gets as input. The other rows are
+    what a linear regression on the present state leaves, scaled to standard deviation 1.
+
+    state        map of the present state; the network gets 0 for unused coordinates  [dim]
+    used         False for coordinates that the dynamics do not depend on             [dim]
+    mean, gain   least squares of x^k - x^0 over the windows of the data, in environment units
+                 [horizon, dim], [horizon, dim, dim]
+    scale        standard deviation of the residual                                   [horizon, dim]
     """
 
     state: Normaliser
-    seen: Tensor
+    used: Tensor
     mean: Tensor
     gain: Tensor
     scale: Tensor
 
+    @classmethod
+    def from_record(cls, state: Normaliser, record: dict[str, Tensor]) -> "ResidualNormaliser":
+        """The normaliser that record() describes."""
+        return cls(state, record["seen"], record["mean"], record["gain"], record["scale"])
+
+    def record(self) -> dict[str, Tensor]:
+        """Tensors by their names in a checkpoint, which calls the used coordinates `seen`."""
+        return {"seen": self.used, "mean": self.mean, "gain": self.gain, "scale": self.scale}
+
     def at(self, present: Tensor) -> Normaliser:
-        """The affine map between z and windows that begin at the states `present` [batch, dim]: centre [batch, horizon, dim],
-        scale [horizon, dim].
+        """The affine map between z and windows that start in the states `present` [batch, dim].
+
+        Its centre is [batch, horizon, dim], its scale [horizon, dim].
         """
-        seen = self.seen.to(present.device)
-        told = torch.where(seen, self.state.encode(present), 0.0)
+        used = self.used.to(present.device)
+        first = torch.where(used, self.state.encode(present), 0.0)
         centre = (
             present[:, None]
             + self.mean.to(present)
-            + torch.einsum("kij,nj->nki", self.gain.to(present), told)
+            + torch.einsum("kij,nj->nki", self.gain.to(present), first)
         )
-        centre[:, 0] = torch.where(seen, self.state.centre.to(present), present)
+        centre[:, 0] = torch.where(used, self.state.centre.to(present), present)
         scale = self.scale.to(present).clone()
         scale[0] = self.state.scale.to(present)
         return Normaliser(centre, scale)

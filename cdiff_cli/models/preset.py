@@ -29,7 +29,7 @@ class SamplerSettings(Strict):
     kernel: Literal["ddpm", "ddim", "dpm++2m", "langevin"] = "ddpm"
     steps: Positive | None = None
     extra_steps: Count = 0
-    temperature: Annotated[float, Field(gt=0, le=1)] = 1.0
+    temperature: Annotated[float, Field(ge=0, le=1)] = 1.0
     polish: bool = False
     return_weight: Annotated[float, Field(ge=0)] = 0.0
 

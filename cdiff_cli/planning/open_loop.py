@@ -16,8 +16,8 @@ from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import Problem
 from cdiff_cli.planning.timing import Timed, candidate_seed, synchronise
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.sampling.noise import Noise
 from cdiff_cli.sampling.sampler import Method, Step, sample
 
@@ -86,7 +86,7 @@ def plan(
             g,
             pins,
             lambda: settings.temperature * noise(),
-            kernel=KERNELS[settings.kernel],
+            kernel=load_kernel(settings.kernel),
             extra_steps=settings.extra_steps,
             on_step=watch,
         ).x

@@ -25,8 +25,8 @@ from cdiff_cli.planning.problem import POLISH_MARGIN
 from cdiff_cli.planning.timing import Timed, synchronise
 from cdiff_cli.planning.warm_start import carry, shift_plan
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.sampling.sampler import Method, Sample, sample
 
 INFEASIBLE_ABOVE = 1e-3
@@ -357,7 +357,7 @@ class Replanner:
             g,
             held,
             lambda: next(noise),
-            kernel=KERNELS[self.sampler.kernel],
+            kernel=load_kernel(self.sampler.kernel),
             extra_steps=self.sampler.extra_steps,
             first=first,
             state=state,

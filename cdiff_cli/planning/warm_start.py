@@ -1,4 +1,4 @@
-"""What a plan of receding-horizon control takes over from the last one: the plan itself, moved on, and the multipliers."""
+"""What a plan takes over from the previous one: the plan itself, shifted, and the multipliers."""
 
 from typing import Any
 
@@ -11,15 +11,19 @@ from cdiff_cli.arrays import Rows, Traj
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.projection.segments import row_blocks
-from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual
+from cdiff_cli.sampling.methods import AlmState
 from cdiff_cli.sampling.sampler import Method
 
 
-def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
-    """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
-    reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
+def shift_plan(window: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
+    """The previous plans shifted by the executed steps, relative to the present window's centre.
+
+    The waypoints that they do not reach are at the centre, 0. Repeating the last waypoint there
+    would show a robot that stops, which a few denoising steps do not correct.
+
+    last   environment units [n, horizon, dim]
     """
-    y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - to.centre
+    y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - window.centre
     y[:, -steps:] = 0.0
     return y
 
@@ -66,8 +70,8 @@ def _moved(
     if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
         return fresh
     out = fresh.clone()
-    planes = isinstance(method, PrimalDual | AugmentedLagrangian) and method.on != "noisy"
-    for block in row_blocks(g, horizon, planes):
+    on_clean_estimate = getattr(method, "on", "noisy") != "noisy"
+    for block in row_blocks(g, horizon, planes=on_clean_estimate):
         kept = max(block.stop - block.start - executed, 0)
         out[:, block.start : block.start + kept] = last[:, block.stop - kept : block.stop]
     return out

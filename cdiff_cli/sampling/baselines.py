@@ -12,6 +12,22 @@ from cdiff_cli.sampling.sampler import PlannerKind, Step
 
 
 @dataclass(frozen=True)
+class Unconstrained:
+    """Diffuser: x_{t-1} = reverse(x0), g is ignored."""
+
+    enforces: ClassVar[bool] = False
+    polished: ClassVar[bool] = False
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
+
+    def init(self, x: Traj, g: Constraint) -> None:
+        return None
+
+    def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
+        return step.reverse(step.x0), None
+
+
+@dataclass(frozen=True)
 class Guidance:
     """x_{t-1} = reverse(x0) - weight sum dg(x_t): a push of constant weight along every row's gradient, violated or not.
 

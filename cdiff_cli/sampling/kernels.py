@@ -59,6 +59,3 @@ def langevin(
     beta = 1 - a / b
     score = -(x - math.sqrt(a) * x0) / (1 - a)
     return x + beta / 2 * score + math.sqrt(beta) * z
-
-
-KERNELS: dict[str, Kernel] = {"ddpm": ddpm, "ddim": ddim, "dpm++2m": dpmpp_2m, "langevin": langevin}

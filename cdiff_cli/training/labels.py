@@ -1,4 +1,4 @@
-"""Classifier-free conditioning: labels of training windows by constraints, what is observed beside them, the guided estimate."""
+"""Labels for classifier-free guidance: whether a training window satisfies the constraints."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +19,10 @@ LABELS = 2  # entries of a label
 class ConstraintLabel:
     """Constraints that a planner is conditioned on.
 
-    name      of the constraint file, without its ending
-    g         environment units
-    sha256    of what the file says, comments left out
-    observed  names of the quantities that g waits for
+    name       name of the constraint file, without its ending
+    g          environment units
+    sha256     hash of the content of the file, without comments
+    observed   names of the observed quantities that g depends on
     """
 
     name: str
@@ -35,28 +35,28 @@ class ConstraintLabel:
         """The constraints of a file; raises SpecError."""
         observable = observable_of(task)
         kinds, g = load_constraints(path, task.name, task.layout, None, observable, task.dt)
-        waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
-        return cls(
-            path.stem, g, kinds_sha256(kinds), tuple(name for name in observable if name in waits)
-        )
+        used = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
+        observed = tuple(name for name in observable if name in used)
+        return cls(path.stem, g, kinds_sha256(kinds), observed)
 
     @property
     def entries(self) -> int:
-        """What a network is told: a label, and each quantity."""
+        """Number of inputs that a network gets: the label, and each observed quantity."""
         return LABELS + len(self.observed)
 
-    def label(self, x: Traj, seen: ObservedValues | None = None, dt: float = 1.0) -> Tensor:
-        """(1 where a window obeys g, else -1; its largest g clipped to [0, 1]) [batch, 2]. x in environment units.
+    def label(self, x: Traj, observed: ObservedValues | None = None, dt: float = 1.0) -> Tensor:
+        """(1 if a window satisfies g, else -1; its largest g clipped to [0, 1]) [batch, 2].
 
-        seen   what is observed at the first waypoint of each window
-        dt     seconds between waypoints
+        x          windows, environment units
+        observed   observed quantities at the first waypoint of each window
+        dt         time between waypoints [s]
         """
-        g = self.g.bind(seen or {}, dt, x.shape[1])
+        g = self.g.bind(observed or {}, dt, x.shape[1])
         worst = g.to(x)(x).amax(1)
         return torch.stack((torch.where(worst <= 0, 1.0, -1.0), worst.clamp(0.0, 1.0).float()), 1)
 
 
 def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """The labels with that share of them, drawn at random, replaced by zeros: no condition."""
+    """Labels, a random share of them replaced by zeros, which mean no condition."""
     keep = torch.rand(len(label), 1, generator=generator) >= share
     return label * keep

@@ -453,7 +453,7 @@ def test_help_names_every_command_and_imports_no_torch():
 
 @pytest.mark.parametrize("task", ["maze2d-umaze", "maze2d-large", "gaussian2d"])
 def test_every_recipe_is_valid_and_every_preset_makes_its_methods(task):
-    from cdiff_cli.sampling.methods import make_method
+    from cdiff_cli.sampling import make_method
 
     recipe = load_recipe(task)
     assert isinstance(recipe, Recipe)

@@ -13,7 +13,7 @@ from cdiff_cli.commands.margins import (
 )
 from cdiff_cli.models.preset import ControlSettings, Preset, SamplerSettings
 from cdiff_cli.paths import home
-from cdiff_cli.sampling.methods import make_method, settings_of
+from cdiff_cli.sampling import complete_settings
 from cdiff_cli.yaml_files import load
 
 NOW = Preset(
@@ -199,4 +199,4 @@ def test_shipped_calibrations_name_settings_that_their_methods_have():
         for one in load(path, CalibrationFile).calibrated:
             (method, constants), *others = one.preset.methods.items()
             assert (method, others, one.preset.extra_steps) == (one.method, [], {}), path
-            assert settings_of(method, make_method(method, constants)) == constants, path
+            assert complete_settings(method, constants) == constants, path

@@ -14,6 +14,7 @@ from cdiff_cli.evaluation import metrics
 from cdiff_cli.evaluation.metrics import (
     acceleration,
     boundary_mass,
+    control_metrics,
     distance,
     hits_wall,
     jump,
@@ -25,6 +26,7 @@ from cdiff_cli.evaluation.metrics import (
     worst_segment,
     worst_waypoint,
 )
+from cdiff_cli.planning.episodes import Episodes
 from tests.problems import ball, chain, num, vec, waypoints
 
 XY = (0, 1)
@@ -37,7 +39,7 @@ def _plan(*points):
     return np.array([points], dtype=np.float64)
 
 
-# violation ------------------------------------------------------------------------------------------------------------
+# violation --------------------------------------------------------------------------------------
 
 
 def test_violation_sums_the_positive_rows_only():
@@ -80,7 +82,7 @@ def test_boundary_mass_counts_unsafe_and_nearly_unsafe_samples():
     assert boundary_mass(LEFT, x, 0.1) == pytest.approx(0.5)
 
 
-# motion ---------------------------------------------------------------------------------------------------------------
+# motion -----------------------------------------------------------------------------------------
 
 
 def test_distance_sums_lengths_in_the_named_columns_and_broadcasts():
@@ -126,7 +128,7 @@ def test_acceleration_is_the_largest_change_of_velocity_over_dt():
     assert acceleration(x, (2, 3), 0.1) == pytest.approx([5.0])
 
 
-# walls ----------------------------------------------------------------------------------------------------------------
+# walls ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -175,7 +177,7 @@ def test_a_single_waypoint_inside_a_box_is_a_hit():
     assert hits_wall(_plan((0.5, 0.5)), XY, BOX).tolist() == [True]
 
 
-# tables ---------------------------------------------------------------------------------------------------------------
+# tables -----------------------------------------------------------------------------------------
 
 
 def test_rollout_metrics_stop_where_the_episode_stops():
@@ -249,7 +251,9 @@ def test_plan_metrics_measure_each_plan_in_the_tasks_columns():
 
 
 def test_a_single_plan_has_no_distance_to_the_mean_of_several():
-    task = SimpleNamespace(layout=("x", "y"), positions=("x", "y"), velocities=(), dt=1.0)
+    task = SimpleNamespace(
+        layout=("x", "y"), positions=("x", "y"), velocities=(), dt=1.0, walls=lambda: BOX[:0]
+    )
     (row,) = plan_metrics(
         task,
         Constraint(()),
@@ -259,6 +263,65 @@ def test_a_single_plan_has_no_distance_to_the_mean_of_several():
     )
     assert "distance_paper" not in row
     assert row["distance"] == pytest.approx(1.0)
+
+
+def test_wall_hits_need_walls_not_velocities():
+    def columns(velocities, boxes):
+        task = SimpleNamespace(
+            layout=("x", "y", "vx", "vy"),
+            positions=("x", "y"),
+            velocities=velocities,
+            dt=1.0,
+            walls=lambda: boxes,
+            footprint=0.0,
+            is_free=lambda *_: True,
+        )
+        x = np.full((1, 2, 4), 0.5)
+        return plan_metrics(task, Constraint(()), x, x, SimpleNamespace(violation=1.0))[0]
+
+    assert columns((), BOX)["wall"] == 1.0
+    assert "mean_speed" not in columns((), BOX)
+    assert "wall" not in columns(("vx", "vy"), BOX[:0])
+
+
+def test_only_contact_of_what_the_environment_reports_is_a_metric():
+    episodes = Episodes(
+        x=np.zeros((1, 3, 2)),
+        u=np.array([[[1.0], [0.2]]]),
+        reward=np.array([[1.0, np.nan]]),
+        predicted=np.zeros((1, 3, 2)),
+        predicted_levels=np.zeros((1, 3, 1)),
+        observed={},
+        violation=np.array([[0.5, np.nan]]),
+        calls=np.array([[4.0, np.nan]]),
+        braked=np.array([[1.0, 0.0]]),
+        info={"contact": np.array([[1.0, np.nan]]), "height": np.array([[3.0, 3.0]])},
+        fell=np.array([True]),
+        diverged=np.array([False]),
+        latency_s=np.array([0.3, 0.1]),
+        network_s=np.array([0.1, 0.1]),
+    )
+    levels = np.array([[[-1.0], [0.25], [np.nan]]])
+    (row,) = control_metrics(episodes, levels, (np.array([-1.0]), np.array([1.0])))
+    assert list(row.items()) == [
+        ("reward", 1.0),
+        ("plan_violation", 0.5),
+        ("safe_plans", 0.0),
+        ("safe_executed", 0.0),
+        ("executed_violation", 0.25),
+        ("executed_worst", 0.25),
+        ("violation_rate", 50.0),  # one of two states
+        ("fell", 1.0),
+        ("diverged", 0.0),
+        ("braked", 100.0),
+        ("saturation", 100.0),
+        ("steps", 1.0),
+        ("calls", 4.0),
+        ("latency_ms", pytest.approx(200.0)),
+        ("latency_p95", pytest.approx(290.0)),
+        ("overhead", pytest.approx(100.0)),
+        ("contacts", 1.0),
+    ]
 
 
 def test_a_plan_is_smooth_up_to_a_fifth_more_than_the_data():

@@ -18,8 +18,8 @@ from cdiff_cli.constraints.spec.load import load_constraints
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.kernels import ddpm
 from cdiff_cli.sampling.sampler import sample
 from cdiff_cli.tasks import load_task
 from tests.problems import F64, normal
@@ -67,7 +67,7 @@ def test_sampling_names_the_device_of_every_tensor(file, method):
             g,
             pins,
             lambda: next(draws),
-            kernel=KERNELS["ddpm"],
+            kernel=ddpm,
         ).x
 
     twice(work)
@@ -112,7 +112,7 @@ def test_plans_of_control_name_the_device_of_every_tensor(task, method):
             g,
             pins,
             lambda: next(left),
-            kernel=KERNELS["ddpm"],
+            kernel=ddpm,
         ).x
 
     twice(work)

@@ -13,7 +13,7 @@ from cdiff_cli.models.recipe import Recipe, load_recipe
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.sampling.kernels import KERNELS
+from cdiff_cli.sampling import KERNELS
 from cdiff_cli.yaml_files import load
 
 PRESETS = "presets:\n  fast:\n    sampler: {kernel: dpm++2m, steps: 6, polish: true}\n"

@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdiff_cli.commands.resolve import Request, needed_speed, parse_settings, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import needed_speed, parse_settings, resolve
 from cdiff_cli.errors import CdiffError, InfeasibleError
+from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.planning.execution import follow
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.planning.problem import MARGIN, check_feasible
+from cdiff_cli.planning.problem import POLISH_MARGIN, check_feasible
 from cdiff_cli.planning.start_goal import parse_state
-from cdiff_cli.sampling.methods import Projected, Unconstrained, make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.baselines import Unconstrained
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.tasks import load_task
 
 
@@ -28,39 +32,47 @@ def test_a_plan_of_a_seed_does_not_depend_on_its_batch(umaze):
 
 
 def test_projection_on_the_clean_estimate_leaves_a_plan_that_already_obeys_unchanged(umaze):
-    loose = replace(umaze.problem, enforced=umaze.problem.g.tighten(-100.0))
+    loose = replace(umaze.problem, enforced=umaze.problem.declared.tighten(-100.0))
     np.testing.assert_array_equal(
-        plan(loose, Projected(), [0]).x, plan(loose, Unconstrained(), [0]).x
+        plan(loose, CleanProjected(), [0]).x, plan(loose, Unconstrained(), [0]).x
     )
 
 
 def test_polish_ends_a_margin_inside(umaze):
-    plans = plan(replace(umaze.problem, enforced=umaze.problem.g), Projected(), [0, 1], polish=True)
+    plans = plan(
+        replace(umaze.problem, enforced=umaze.problem.declared),
+        CleanProjected(),
+        [0, 1],
+        SamplerSettings(polish=True),
+    )
     values = plans.x[..., 0] - plans.x[..., 1] - 1.82
-    assert values.max() <= -0.99 * MARGIN
+    assert values.max() <= -0.99 * POLISH_MARGIN
     assert plans.polish.max() < 1e-4
 
 
 def test_calls_count_the_extra_steps(umaze):
     method = make_method("alm", {"on": "noisy"})
-    problem = replace(umaze.problem, enforced=umaze.problem.g)
-    assert plan(problem, method, [0], extra_steps=3).calls == problem.schedule.n_steps + 3
+    problem = replace(umaze.problem, enforced=umaze.problem.declared)
+    assert plan(problem, method, [0], SamplerSettings(extra_steps=3)).calls == (
+        problem.planner.schedule.n_steps + 3
+    )
 
 
 def test_a_diverged_plan_is_said_aloud(umaze):
-    broken = replace(umaze.problem, denoiser=lambda x, _: x * float("nan"))
+    lost = replace(umaze.planner, denoiser=lambda x, _: x * float("nan"))
+    broken = replace(umaze.problem, planner=lost)
     with pytest.raises(CdiffError, match=r"seeds \[0\] diverged to NaN"):
         plan(broken, Unconstrained(), [0])
 
 
 def test_a_start_outside_the_constraints_is_refused(umaze):
     with pytest.raises(InfeasibleError, match='"cut-corner" excludes the start'):
-        check_feasible(replace(umaze.problem, g=umaze.problem.g.tighten(0.5)))
+        check_feasible(replace(umaze.problem, declared=umaze.problem.declared.tighten(0.5)))
 
 
 def test_random_pairs_are_free_allowed_and_within_the_data_speed():
     resolved = resolve(Request(n=20, random=True))
-    task, card = resolved.problem.task, resolved.checkpoint.card
+    task, card = resolved.task, resolved.checkpoint.card
     for start, goal in zip(resolved.problem.start, resolved.problem.goal, strict=True):
         assert task.is_free(start[:2], 0.1)
         assert start[0] - start[1] <= 1.82

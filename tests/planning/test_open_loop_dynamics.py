@@ -7,8 +7,9 @@ import pytest
 import torch
 import yaml
 
+from cdiff_cli.commands.experiment import Request
 from cdiff_cli.commands.plan import plan_run
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.verify import verify_run
 from cdiff_cli.constraints.dynamics import dynamics_of
 from cdiff_cli.constraints.state_sets import HalfSpace
@@ -17,12 +18,15 @@ from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, SpecError
 from cdiff_cli.evaluation.metrics import hits_wall
 from cdiff_cli.models.checkpoint import load_checkpoint, read_safetensors, save_checkpoint
+from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.paths import home
 from cdiff_cli.planning.execution import follow
-from cdiff_cli.planning.open_loop import plan, polish_plans
+from cdiff_cli.planning.open_loop import plan
+from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import check_feasible
 from cdiff_cli.projection.project import project_reachable
-from cdiff_cli.sampling.methods import Projected, make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.tasks.maze2d import UMAZE, Maze2D
 from cdiff_cli.tasks.protocol import Tolerances
 
@@ -66,9 +70,7 @@ def resolved(checkpoint, constraints):
 
 @pytest.fixture(scope="module")
 def plans(resolved):
-    return plan(
-        resolved.problem, resolved.method, resolved.seeds, kernel=resolved.kernel, polish=True
-    )
+    return plan(resolved.problem, resolved.method, resolved.seeds, resolved.preset.sampler)
 
 
 def test_a_polished_plan_is_what_its_inputs_produce_within_their_bounds(resolved, plans):
@@ -95,17 +97,18 @@ def test_without_dynamics_there_are_no_inputs(resolved):
 
 def test_planned_inputs_fed_forward_keep_the_execution_on_the_plan(resolved, plans):
     """A millimetre where no wall is touched; what float32 forces and the simulator's own steps leave is far less."""
-    task = resolved.problem.task
+    task = resolved.task
     assert not hits_wall(plans.x, [0, 1], task.walls()).any()
     done = follow(task, plans.x, resolved.seeds, hold=5, planned=plans.u)
     np.testing.assert_allclose(done.x[:, :128, :2], plans.x[..., :2], atol=1e-3)
     assert done.success.all()
-    assert float(resolved.problem.g.parts[0](torch.from_numpy(done.x)).max()) <= 0.0
+    assert float(resolved.problem.declared.parts[0](torch.from_numpy(done.x)).max()) <= 0.0
 
 
 def test_a_goal_out_of_reach_is_missed_in_the_plan_that_is_kept(resolved):
     """From rest to 2 m away in 16 steps: the plan remains one that the inputs make, and its end is where they lead."""
-    problem = replace(resolved.problem, horizon=16)
+    short = replace(resolved.planner, horizon=16)
+    problem = replace(resolved.problem, planner=short)
     z = torch.zeros(1, 16, 4, dtype=torch.float64)
     x, _, u = polish_plans(problem, z)
     x = problem.normaliser.decode(x).numpy()
@@ -151,11 +154,11 @@ def test_a_goal_closer_to_the_boundary_than_the_clearance_is_planned_for(resolve
     g = Constraint((AtWaypoints("near", level),))
     problem = replace(
         resolved.problem,
-        g=g,
+        declared=g,
         enforced=Constraint((*g.parts, *dynamics_of(resolved.problem.enforced))),
     )
-    for method in (Projected(), make_method("alm", {})):
-        plans = plan(problem, method, [0], polish=True)
+    for method in (CleanProjected(), make_method("alm", {})):
+        plans = plan(problem, method, [0], SamplerSettings(polish=True))
         assert np.abs(plans.x[0, -1] - problem.goal).max() < 1e-3
 
 
@@ -178,11 +181,13 @@ def test_a_start_closer_to_the_boundary_than_the_clearance_does_not_cost_the_goa
 def test_the_trace_counts_the_constraints_as_they_are_scored_and_not_the_dynamics(resolved):
     scored = Constraint(
         tuple(
-            part for part in resolved.problem.g.parts if part not in dynamics_of(resolved.problem.g)
+            part
+            for part in resolved.problem.declared.parts
+            if part not in dynamics_of(resolved.problem.declared)
         )
     )
-    problem = replace(resolved.problem, g=scored)
-    plans = plan(problem, resolved.method, [0], kernel=resolved.kernel)
+    problem = replace(resolved.problem, declared=scored)
+    plans = plan(problem, resolved.method, [0])
     noisy = [float(scored(torch.from_numpy(x)).clamp_min(0).sum()) for x in plans.chain[:-1]]
     np.testing.assert_allclose(
         plans.trace[:, 0, 0], noisy, rtol=1e-4, atol=1e-4
@@ -235,11 +240,12 @@ def test_a_task_says_how_near_to_its_pins_a_plan_must_end(resolved, careful, mon
         tolerances.append(words[-1])
         return project_reachable(*words)
 
-    monkeypatch.setattr("cdiff_cli.planning.open_loop.project_reachable", counted)
+    monkeypatch.setattr("cdiff_cli.planning.polish.project_reachable", counted)
     z = torch.zeros(1, 16, 4, dtype=torch.float64)
-    polish_plans(replace(careful.problem, horizon=16), z)
+    short = replace(careful.planner, horizon=16)
+    polish_plans(replace(careful.problem, planner=short), z)
     assert tolerances == [5e-4]
-    polish_plans(replace(resolved.problem, horizon=16), z)
+    polish_plans(replace(resolved.problem, planner=short), z)
     assert tolerances[1:] == [5e-4, 5e-5, 5e-6, 5e-6]
 
 
@@ -247,6 +253,6 @@ def test_a_start_is_free_where_the_task_has_room_for_its_footprint(resolved, car
     """0.2 m from the outer wall on the left, x = -1.5."""
     assert UMAZE.footprint == 0.1
     start, g = np.array([-1.3, 1.0, 0.0, 0.0]), Constraint(())
-    check_feasible(replace(resolved.problem, start=start, g=g))
+    check_feasible(replace(resolved.problem, start=start, declared=g), resolved.task)
     with pytest.raises(CdiffError, match="inside a wall or touches one"):
-        check_feasible(replace(careful.problem, start=start, g=g))
+        check_feasible(replace(careful.problem, start=start, declared=g), careful.task)

@@ -1,5 +1,6 @@
 """Acting: replanning at every step, on a point mass whose planner and inverse dynamics are known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,12 +16,18 @@ from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.networks import InverseDynamics
 from cdiff_cli.models.normaliser import Normaliser, ResidualNormaliser
+from cdiff_cli.models.planner import Planner
+from cdiff_cli.models.preset import ControlSettings, SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.episodes import Episodes
-from cdiff_cli.planning.receding_horizon import Controller, control
-from cdiff_cli.planning.warm_start import CarriedMultipliers
-from cdiff_cli.sampling.baselines import BestOf
-from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
+from cdiff_cli.planning.receding_horizon import Controller, rollout
+from cdiff_cli.sampling.baselines import BestOf, Unconstrained
+from cdiff_cli.sampling.clean_methods import (
+    CleanAugmentedLagrangian,
+    CleanPrimalDual,
+    CleanProjected,
+)
+from cdiff_cli.sampling.methods import PrimalDual
 from tests.problems import F64, chain, vec
 
 DT, H = 0.1, 6
@@ -106,41 +113,59 @@ def mean_window(x: torch.Tensor, t: int) -> torch.Tensor:
 
 
 LIMIT = chain(HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5)
-FREE = Controller(
-    task=MassTask(),  # type: ignore[arg-type]
+WARM = ControlSettings(warm_start=0.4)
+PLAIN, POLISHED = SamplerSettings(), SamplerSettings(polish=True)
+PLANNER = Planner(
     denoiser=mean_window,
     schedule=Schedule.cosine(3),
-    frame=frame(),
-    inverse=inverse(),
-    g=LIMIT,
-    enforced=LIMIT,
-    method=Unconstrained(),
-    device=torch.device("cpu"),
+    normaliser=frame(),
+    horizon=H,
+    coordinates=MassTask.layout,
+    dt=DT,
+    inverse_dynamics=lambda x, following: inverse()(
+        *(torch.from_numpy(states).float() for states in (x, following))
+    ).numpy(),
 )
+FREE = Controller(PLANNER, LIMIT, Unconstrained(), sampler=PLAIN)
+HELD = replace(FREE, method=CleanProjected(), sampler=POLISHED)
+
+
+def act(controller: Controller, seeds: Sequence[int], env: Any = None, **options: Any) -> Episodes:
+    return rollout(controller, MassTask(), seeds, env, **options)
+
+
+def asking(denoiser: Any) -> Planner:
+    return replace(PLANNER, denoiser=denoiser)
+
+
+class Plain:
+    """The answers of a method that ignores the constraints."""
+
+    enforces, polished, candidates, planner = False, False, 1, "unconditional"
 
 
 def same(a: Episodes, b: Episodes, rows: slice) -> None:
-    for name in ("x", "u", "reward", "planned", "violation"):
+    for name in ("x", "u", "reward", "predicted", "violation"):
         np.testing.assert_array_equal(getattr(a, name)[rows], getattr(b, name))
 
 
 def test_the_plan_is_followed_exactly_by_the_exact_inverse_dynamics():
-    done = control(FREE, [0, 1])
+    done = act(FREE, [0, 1])
     np.testing.assert_allclose(
         done.x[:, 1:, 1] - done.x[:, :-1, 1], 0.1, atol=1e-5
     )  # the network is float32
-    np.testing.assert_allclose(done.x[:, :, 1], done.planned[:, :, 1], atol=1e-5)
+    np.testing.assert_allclose(done.x[:, :, 1], done.predicted[:, :, 1], atol=1e-5)
     np.testing.assert_allclose(done.observed["clock"], done.x[..., 0])
 
 
 def test_an_episode_does_not_depend_on_its_neighbours():
-    same(control(FREE, [3, 4, 5]), control(FREE, [4]), slice(1, 2))
+    same(act(FREE, [3, 4, 5]), act(FREE, [4]), slice(1, 2))
 
 
 def test_projected_plans_never_let_the_speed_pass_its_limit():
     free, held = (
-        control(FREE, [0, 1]),
-        control(replace(FREE, method=Projected(), polish=True), [0, 1]),
+        act(FREE, [0, 1]),
+        act(HELD, [0, 1]),
     )
     assert free.x[:, :, 1].max() > 1.5
     assert held.x[:, :, 1].max() <= 0.75 + 1e-5
@@ -150,21 +175,21 @@ def test_projected_plans_never_let_the_speed_pass_its_limit():
 
 
 def test_a_barrier_approaches_its_limit_no_faster_than_alpha_allows():
-    held = control(replace(FREE, method=Projected(), polish=True), [0])
+    held = act(HELD, [0])
     h = 0.75 - held.x[0, :, 1]
     assert (h[1:] >= 0.5 * h[:-1] - 1e-5).all()
 
 
 def test_each_plan_is_followed_for_as_many_steps_as_asked():
-    done = control(replace(FREE, execute=4), [0], steps=10)
+    done = act(replace(FREE, control=ControlSettings(execute=4)), [0], steps=10)
     assert np.isfinite(done.violation[0]).nonzero()[0].tolist() == [0, 4, 8]
     assert len(done.latency_s) == 3
     np.testing.assert_allclose(done.x[0, 1:, 1] - done.x[0, :-1, 1], 0.1, atol=1e-5)
-    np.testing.assert_allclose(done.planned[0, :, 1], done.x[0, :, 1], atol=1e-4)
+    np.testing.assert_allclose(done.predicted[0, :, 1], done.x[0, :, 1], atol=1e-4)
 
 
 def test_an_episode_that_falls_ends_alone():
-    done = control(FREE, [0, 1], {"fall": 0.5}, steps=20)
+    done = act(FREE, [0, 1], {"fall": 0.5}, steps=20)
     assert done.fell.all()
     ends = np.isfinite(done.reward).sum(1)
     assert (ends < 20).all()
@@ -178,14 +203,14 @@ def test_a_plan_that_is_not_finite_ends_its_episode_and_no_other():
         z = mean_window(x, t)
         return torch.where(x[:, :1, 1:] > 0.55, torch.nan, z)
 
-    slow = control(replace(FREE, denoiser=broken), [0, 1])
+    slow = act(replace(FREE, planner=asking(broken)), [0, 1])
     assert slow.diverged.all()
     assert not slow.fell.any()
     assert 4 <= np.isfinite(slow.reward[0]).sum() <= 7
 
 
 def test_disturbed_inputs_are_recorded_as_executed():
-    done = control(replace(FREE, action_noise=0.1), [0], steps=8)
+    done = act(replace(FREE, control=ControlSettings(action_noise=0.1)), [0], steps=8)
     np.testing.assert_allclose(np.diff(done.x[0, :, 1]), DT * done.u[0, :, 0], atol=1e-6)
     assert done.u[0, :, 0].std() > 0.3
 
@@ -197,21 +222,23 @@ def test_a_warm_plan_redoes_its_share_of_the_steps():
         calls.append(t)
         return mean_window(x, t)
 
-    warm = replace(FREE, denoiser=counted, warm=0.4)
-    control(warm, [0], steps=3)
+    warm = replace(FREE, planner=asking(counted), control=WARM)
+    act(warm, [0], steps=3)
     assert calls == [3, 2, 1, 1, 1]
     assert warm.calls == 1
 
 
 def test_executed_levels_are_scored_against_what_was_observed_then():
-    done = control(FREE, [0, 1], steps=5)
+    done = act(FREE, [0, 1], steps=5)
     levels = metrics.executed_levels(LIMIT, done.x, done.observed, DT)
     np.testing.assert_allclose(levels[..., 0], done.x[..., 1] - 0.75)
-    np.testing.assert_allclose(done.foreseen[:, 1:, 0], done.planned[:, 1:, 1] - 0.75, atol=1e-6)
+    np.testing.assert_allclose(
+        done.predicted_levels[:, 1:, 0], done.predicted[:, 1:, 1] - 0.75, atol=1e-6
+    )
 
 
 def test_metrics_of_an_episode():
-    done = control(FREE, [0], steps=10)
+    done = act(FREE, [0], steps=10)
     levels = metrics.executed_levels(LIMIT, done.x, done.observed, DT)
     (row,) = metrics.control_metrics(done, levels, (np.array([-10.0]), np.array([10.0])))
     over = np.clip(done.x[0, :, 1] - 0.75, 0, None)
@@ -226,9 +253,7 @@ def test_waypoint_constraints_ask_nothing_of_the_state_that_is_already_there():
     held = Constraint(
         (AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), torch.tensor(0.01, dtype=F64))),)
     )
-    done = control(
-        replace(FREE, method=Projected(), polish=True, g=held, enforced=held), [0], steps=5
-    )
+    done = act(replace(HELD, declared=held), [0], steps=5)
     assert done.x[0, 0, 1] > 0.01
     assert done.x[0, 1:, 1].max() <= 0.01 + 1e-5
 
@@ -238,10 +263,8 @@ def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     narrow = (AtWaypoints("low", HalfSpace(vec(0.0, 1.0), torch.tensor(0.2, dtype=F64))),)
     narrow += (AtWaypoints("high", HalfSpace(vec(0.0, -1.0), torch.tensor(-0.4, dtype=F64))),)
     never = Constraint(narrow)
-    acting = replace(
-        FREE, method=Projected(), polish=True, g=never, enforced=never, brake=lambda x: -x[1:]
-    )
-    done = control(acting, [0], steps=5)
+    acting = replace(HELD, declared=never, fallback_action=lambda x: -x[1:])
+    done = act(acting, [0], steps=5)
     assert (done.braked == 1).all()
     np.testing.assert_allclose(done.x[0, 1:, 1], 0.9 * done.x[0, :-1, 1], atol=1e-6)
     (row,) = metrics.control_metrics(
@@ -253,14 +276,14 @@ def test_where_no_plan_obeys_the_agent_brakes_and_it_is_counted():
     assert np.isfinite(
         [row["latency_ms"], row["overhead"]]
     ).all()  # where no network call came through, too
-    assert (control(replace(acting, enforced=LIMIT), [0], steps=5).braked == 0).all()
+    assert (act(replace(acting, enforced=LIMIT), [0], steps=5).braked == 0).all()
 
 
 def test_what_a_step_tells_reaches_the_method():
     """SafeDiffuser's variants ask how many steps are left."""
     told = []
 
-    class Asked:
+    class Asked(Plain):
         def init(self, x, g):
             return None
 
@@ -268,7 +291,7 @@ def test_what_a_step_tells_reaches_the_method():
             told.append((step.left, step.last))
             return step.reverse(step.x0), state
 
-    control(replace(FREE, method=Asked()), [0], steps=1)
+    act(replace(FREE, method=Asked()), [0], steps=1)
     assert told == [(2, False), (1, False), (0, True)]
 
 
@@ -282,7 +305,9 @@ def test_what_a_warm_plan_does_not_reach_goes_on_as_the_frame_foresees():
         seen.append((t, x))
         return torch.where(torch.arange(H)[:, None] > 0, 0.3, x)
 
-    control(replace(FREE, denoiser=off, warm=0.4, execute=2, temperature=0.0), [0], steps=4)
+    cold = SamplerSettings(temperature=0.0)
+    two = ControlSettings(warm_start=0.4, execute=2)
+    act(replace(FREE, planner=asking(off), sampler=cold, control=two), [0], steps=4)
     assert [t for t, _ in seen] == [3, 2, 1, 1]
     began = seen[-1][1][0]
     assert (began[-2:] == 0).all()
@@ -301,29 +326,32 @@ def observed_limit() -> Constraint:
 def test_a_warm_plan_that_no_longer_obeys_what_is_observed_is_made_anew():
     """Plans speed up by 0.1 a step from below 0.1, over five steps: the third or fourth is the first that comes to the limit."""
     told = observed_limit()
-    acting = replace(FREE, method=Projected(), polish=True, warm=0.4, g=told, enforced=told)
-    done = control(acting, range(6), steps=5)
+    acting = replace(HELD, control=WARM, declared=told)
+    done = act(acting, range(6), steps=5)
     np.testing.assert_array_equal(done.calls[:, :2], [[3, 1]] * 6)
     for i, start in enumerate(done.x[:, 0, 1]):
         np.testing.assert_array_equal(done.calls[i, 2:], [3 if start > 0.05 else 1, 3, 3])
-    same(done, control(acting, [4], steps=5), slice(4, 5))
+    same(done, act(acting, [4], steps=5), slice(4, 5))
     assert len(set(done.calls[:, 2])) == 2  # some of them together, some not
     known = Constraint((AtWaypoints("speed", HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze())),))
     for other in (
-        replace(acting, g=known, enforced=known),
-        replace(acting, method=Unconstrained(), polish=False),
+        replace(acting, declared=known),
+        replace(acting, method=Unconstrained(), sampler=PLAIN),
     ):
-        np.testing.assert_array_equal(control(other, [0], steps=5).calls, [[3, 1, 1, 1, 1]])
+        np.testing.assert_array_equal(act(other, [0], steps=5).calls, [[3, 1, 1, 1, 1]])
 
 
 def test_multipliers_do_not_outlast_what_is_observed():
     counts = Counting()
     told = observed_limit()
-    control(replace(FREE, method=counts, warm=0.4, g=told, enforced=told), [0], steps=4)
+    act(replace(FREE, method=counts, control=WARM, declared=told), [0], steps=4)
     assert counts.begun == [[0], [1], [2], [0], *[[0], [1], [2]] * 2]
 
 
-class Counting:
+class Counting(Plain):
+    # It satisfies something, so that a warm start is watched.
+    polished = True
+
     """Unconstrained; its multipliers, one row of the plan's chain each, count the steps."""
 
     def init(self, x, g):
@@ -336,15 +364,10 @@ class Counting:
 
 def test_multipliers_go_on_from_plan_to_plan_where_that_is_asked_those_of_each_episode_its_own():
     fresh, kept = Counting(), Counting()
-    control(replace(FREE, method=fresh), [0], steps=2)
-    control(replace(FREE, method=kept, resume=True), [0], steps=2)
+    act(replace(FREE, method=fresh), [0], steps=2)
+    act(replace(FREE, method=kept, control=ControlSettings(carry_multipliers=True)), [0], steps=2)
     assert fresh.begun == [[0], [1], [2]] * 2
     assert kept.begun == [[0], [1], [2], [3], [4], [5]]
-    resumed = CarriedMultipliers(
-        Counting(), 0, torch.tensor([[1.0], [2.0], [3.0]]).expand(3, H - 1)
-    )
-    some = CarriedMultipliers(Counting(), 0, resumed.select(np.array([True, False, True])))
-    assert some.init(torch.zeros(2, H, 2), LIMIT)[:, 0].tolist() == [1, 3]
 
 
 def test_the_safest_of_k_plans_is_executed():
@@ -354,13 +377,13 @@ def test_the_safest_of_k_plans_is_executed():
         return x
 
     low = chain(HalfSpace(vec(0.0, 1.0), vec(0.1).squeeze()), 0.5)
-    acting = replace(FREE, denoiser=noisy, g=low, enforced=low)
-    one, many = (control(replace(acting, method=BestOf(k)), [0, 1, 2], steps=4) for k in (1, 16))
+    acting = replace(FREE, planner=asking(noisy), declared=low)
+    one, many = (act(replace(acting, method=BestOf(k)), [0, 1, 2], steps=4) for k in (1, 16))
     assert many.violation[:, :4].mean() < 0.7 * one.violation[:, :4].mean()
     same(
-        one, control(acting, [0, 1, 2], steps=4), slice(0, 3)
+        one, act(acting, [0, 1, 2], steps=4), slice(0, 3)
     )  # the first candidate is the seed's own plan
-    same(many, control(replace(acting, method=BestOf(16)), [1], steps=4), slice(1, 2))
+    same(many, act(replace(acting, method=BestOf(16)), [1], steps=4), slice(1, 2))
     assert replace(acting, method=BestOf(16)).calls == 48
 
 
@@ -369,24 +392,24 @@ def test_a_candidate_that_is_not_finite_is_not_kept():
         z = mean_window(x, t)
         return torch.cat((torch.full_like(z[:1], torch.nan), z[1:]))
 
-    assert not control(
-        replace(FREE, denoiser=broken, method=BestOf(2)), [0], steps=3
+    assert not act(
+        replace(FREE, planner=asking(broken), method=BestOf(2)), [0], steps=3
     ).diverged.any()
 
 
 @pytest.mark.parametrize(
-    "method", [Projected(), PrimalDual(), PrimalDual(on="noisy", eta=0.1), AugmentedLagrangian()]
+    "method", [CleanProjected(), CleanPrimalDual(), PrimalDual(eta=0.1), CleanAugmentedLagrangian()]
 )
 def test_rows_as_one_matrix_give_the_plans_that_part_by_part_gives(method, monkeypatch):
     """To 1e-6: the order of additions in float32 differs."""
     both = Constraint(
         (*LIMIT.parts, *chain(HalfSpace(vec(0.0, -1.0), vec(0.2).squeeze()), 0.3).parts)
     )
-    acting = replace(FREE, method=method, g=both, enforced=both, polish=True)
+    acting = replace(FREE, method=method, declared=both, sampler=POLISHED)
     assert acting.condensed is not None
-    fast = control(acting, [0, 1, 2])
+    fast = act(acting, [0, 1, 2])
     monkeypatch.setattr("cdiff_cli.constraints.trajectory.Constraint.condense", lambda *_: None)
-    plain = control(replace(acting, polish=True), [0, 1, 2])
+    plain = act(replace(acting), [0, 1, 2])
     np.testing.assert_allclose(fast.x, plain.x, atol=1e-6)
-    np.testing.assert_allclose(fast.planned, plain.planned, atol=1e-6)
+    np.testing.assert_allclose(fast.predicted, plain.predicted, atol=1e-6)
     assert fast.violation.max() == plain.violation.max() or method.on == "noisy"

@@ -1,15 +1,14 @@
 """Episodes that begin where they may not be: the shipped planners leave, no error is raised, and what was unsafe is counted."""
 
-from dataclasses import replace
-
 import gymnasium
 import numpy as np
 import pytest
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
-from cdiff_cli.planning.receding_horizon import control
+from cdiff_cli.planning.receding_horizon import rollout
 
 SEEDS = (0, 1)
 
@@ -40,11 +39,11 @@ class Begins:
 
 def acted(name, method, begin, steps):
     """(levels f of the executed states, unsafe above 0 [n, steps + 1], metrics of each episode)."""
-    acting = controller(resolve(Request(task=name, method=method, n=len(SEEDS), device="cpu")))
-    acting = replace(acting, task=Begins(acting.task, begin))
-    done = control(acting, SEEDS, steps=steps)
+    experiment = resolve(Request(task=name, method=method, n=len(SEEDS), device="cpu"))
+    task, g = experiment.task, experiment.declared
+    done = rollout(controller(experiment), Begins(task, begin), SEEDS, steps=steps)
     assert not done.diverged.any()
-    levels = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
+    levels = metrics.executed_levels(g, done.x, done.observed, task.dt)
     bound = np.ones(done.u.shape[2])
     return levels.max(-1), metrics.control_metrics(done, levels, (-bound, bound))
 
@@ -107,7 +106,7 @@ BEYOND = {
 
 def acted_from(case, method):
     name, rate = BEYOND[case]
-    task = resolve(Request(task=name, n=1, device="cpu")).problem.task
+    task = resolve(Request(task=name, n=1, device="cpu")).task
     return acted(name, method, turning(task, rate), 20)
 
 

@@ -10,7 +10,9 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.planning.warm_start import carry, select
 from cdiff_cli.projection.segments import with_tangent_planes
-from cdiff_cli.sampling.methods import AlmState, AugmentedLagrangian, PrimalDual, Projected
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.clean_methods import CleanPrimalDual, CleanProjected
+from cdiff_cli.sampling.methods import AlmState
 from cdiff_cli.sampling.sampler import Step
 from tests.problems import F64, ball, half_space, normal
 
@@ -38,31 +40,31 @@ def carried(method, last, steps=1):
     return begun
 
 
-@pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])
+@pytest.mark.parametrize("name", ["primal-dual", "alm"])
 @pytest.mark.parametrize(
     ("on", "known"), [("noisy", NOISY), ("estimate", PLANES), ("clean", PLANES)]
 )
-def test_one_step_executed_moves_each_block_of_rows_by_one(kind, on, known):
+def test_one_step_executed_moves_each_block_of_rows_by_one(name, on, known):
     last = 100 + torch.arange(known["n"], dtype=F64)[None]
-    assert carried(kind(on=on), last)[0].tolist() == known["expected"]
+    assert carried(make_method(name, {"on": on}), last)[0].tolist() == known["expected"]
 
 
 @pytest.mark.parametrize("steps", [0, 2, 9])
 def test_other_numbers_of_steps(steps):
     last = 1 + torch.arange(15, dtype=F64)[None]
     blocks = [block[steps:] + min(steps, H) * [0.0] for block in last.view(3, H).tolist()]
-    assert carried(PrimalDual(), last, steps).view(3, H).tolist() == blocks
+    assert carried(CleanPrimalDual(), last, steps).view(3, H).tolist() == blocks
 
 
 def test_without_a_last_plan_the_multipliers_begin_at_zero():
     x = torch.zeros(2, H, 2, dtype=F64)
-    assert carry(PrimalDual(), None, G, x, 1).tolist() == [15 * [0.0]] * 2
-    assert carry(Projected(), None, G, x, 1) is None
+    assert carry(CleanPrimalDual(), None, G, x, 1).tolist() == [15 * [0.0]] * 2
+    assert carry(CleanProjected(), None, G, x, 1) is None
 
 
 def test_multipliers_of_another_number_of_plans_are_dropped():
     x = torch.zeros(2, H, 2, dtype=F64)
-    assert not carry(PrimalDual(), torch.ones(3, 15, dtype=F64), G, x, 1).any()
+    assert not carry(CleanPrimalDual(), torch.ones(3, 15, dtype=F64), G, x, 1).any()
 
 
 def test_selected_plans_keep_their_own_multipliers_and_shared_ones_are_kept_whole():
@@ -75,9 +77,9 @@ def test_selected_plans_keep_their_own_multipliers_and_shared_ones_are_kept_whol
     assert select(None, which) is None
 
 
-@pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])
+@pytest.mark.parametrize("name", ["primal-dual", "alm"])
 @pytest.mark.parametrize("on", ["noisy", "clean"])
-def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(kind, on):
+def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(name, on):
     """The wall's multiplier of waypoint 3 alone: a step later waypoint 2 alone is pushed, and along the wall's normal."""
     x = normal(0, 1, H, 2) * 0.1 + torch.tensor(
         [0.3, 3.0], dtype=F64
@@ -86,12 +88,12 @@ def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(kind, o
     at = (4 if on == "noisy" else 0) + 3
     last = torch.zeros(1, g(x).shape[1], dtype=F64)
     last[0, at] = 100.0
-    method = kind(on=on)
+    method = make_method(name, {"on": on})
     lam = carried(method, last)
     pull = g.linearise(x)[1](lam)
     assert pull.abs().sum(-1).nonzero()[:, 1].tolist() == [2]
     torch.testing.assert_close(pull[0, 2], torch.tensor([100.0, -100.0], dtype=F64))
-    state = AlmState(lam, 1.0) if kind is AugmentedLagrangian else lam
+    state = AlmState(lam, 1.0) if name == "alm" else lam
     step = Step(x, x, 0.1, 1.0, lambda clean: clean, Pins.none(x), False)
     moved = (method.step(step, G, state)[0] - x).abs().sum(-1)
     assert moved[0].argmax() == 2

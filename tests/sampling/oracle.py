@@ -36,7 +36,8 @@ from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import Problem
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.methods import METHODS, Unconstrained, make_method
+from cdiff_cli.sampling import METHODS, make_method
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 Array = NDArray[np.float64]

@@ -15,8 +15,9 @@ from cdiff_cli.evaluation.comparison import METHOD_ORDER
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.planning.timing import candidate_seed
-from cdiff_cli.sampling.baselines import BestOf, FinalProjection, Guidance
-from cdiff_cli.sampling.methods import METHODS, Projected, Unconstrained, make_method
+from cdiff_cli.sampling import METHODS, make_method
+from cdiff_cli.sampling.baselines import BestOf, FinalProjection, Guidance, Unconstrained
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.sampling.sampler import Step, sample
 from tests.problems import (
     draws,
@@ -65,8 +66,8 @@ def test_guidance_leaves_pins_alone():
 def test_terminal_is_the_projection_with_latent_correction():
     """By hand: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0)."""
     terminal, g = make_method("terminal", {}), waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
-    assert terminal == Projected(on="clean", correction="latent")
-    assert torch.equal(plans(terminal, g), plans(Projected(correction="latent"), g))
+    assert terminal == CleanProjected(correction="latent")
+    assert torch.equal(plans(terminal, g), plans(CleanProjected(correction="latent"), g))
     x = normal(0, 3, 4, 2)
     out, _ = terminal.step(step_of(x), g, None)
     torch.testing.assert_close(out, x / 2 + 0.8 * (free_projection(g, x) - x), atol=1e-12, rtol=0)
@@ -80,7 +81,7 @@ def test_terminal_has_no_settings_and_records_none(setting):
     ):
         resolve(Request(task="gaussian2d", method="terminal", settings=(setting,)))
     resolved = resolve(Request(task="gaussian2d", method="terminal"))
-    assert resolved.method == Projected(on="clean", correction="latent")
+    assert resolved.method == CleanProjected(correction="latent")
     assert resolved.record()["preset"]["methods"] == {"terminal": {}}
     assert resolved.row()["method"] == "terminal"
 
@@ -142,7 +143,7 @@ def test_candidates_of_neighbouring_seeds_share_no_noise():
 
 
 def test_every_method_has_its_place_in_tables_and_help():
-    assert set(METHODS) == set(METHOD_ORDER)
+    assert tuple(METHODS) == METHOD_ORDER
 
 
 def test_only_these_methods_are_treated_differently():

@@ -12,8 +12,8 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.sampling.kernels import KERNELS
-from cdiff_cli.sampling.methods import Projected
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.clean_methods import CleanProjected
 from cdiff_cli.sampling.sampler import Step
 from tests.problems import generator, normal
 from tests.sampling.oracle import (
@@ -250,14 +250,17 @@ def test_the_latent_step_is_the_kernel_from_the_shifted_sample(kernel):
         x0,
         SCHEDULE.beta(i),
         math.sqrt(b),
-        lambda clean: KERNELS[kernel](x, clean, z, a, b),
+        lambda clean: load_kernel(kernel)(x, clean, z, a, b),
         pins,
         False,
     )
-    latent, _ = Latent(Projected(), SCHEDULE).step(step, g, (None, i))
-    clean, _ = Projected().step(replace(step, reverse=lambda clean: clean), g, None)
+    latent, _ = Latent(CleanProjected(), SCHEDULE).step(step, g, (None, i))
+    clean, _ = CleanProjected().step(replace(step, reverse=lambda clean: clean), g, None)
     torch.testing.assert_close(
-        latent, KERNELS[kernel](x + math.sqrt(a) * (clean - x0), clean, z, a, b), atol=1e-12, rtol=0
+        latent,
+        load_kernel(kernel)(x + math.sqrt(a) * (clean - x0), clean, z, a, b),
+        atol=1e-12,
+        rtol=0,
     )
 
 

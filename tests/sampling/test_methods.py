@@ -12,17 +12,25 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.sampling.methods import (
-    METHODS,
-    AugmentedLagrangian,
-    PrimalDual,
-    Projected,
+from cdiff_cli.sampling import FORMS, METHODS, complete_settings, make_method
+from cdiff_cli.sampling.baselines import (
+    BestOf,
+    Conditional,
+    FinalProjection,
+    Guidance,
     Unconstrained,
-    make_method,
-    multiplier,
-    slack,
 )
+from cdiff_cli.sampling.clean_methods import (
+    CleanAugmentedLagrangian,
+    CleanPrimalDual,
+    CleanProjected,
+    EstimateAugmentedLagrangian,
+    EstimatePrimalDual,
+)
+from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected
+from cdiff_cli.sampling.multipliers import multiplier, slack
 from cdiff_cli.sampling.noise import Noise
+from cdiff_cli.sampling.safediffuser import SafeDiffuser
 from cdiff_cli.sampling.sampler import Step, sample
 from tests.problems import (
     F64,
@@ -61,17 +69,17 @@ def _unit_mean_shift(method):
 
 
 def test_primal_dual_multiplier_of_unit_mean_shift_is_one():
-    _unit_mean_shift(PrimalDual(on="noisy", eta=0.05, expectation="batch_mean"))
+    _unit_mean_shift(PrimalDual(eta=0.05, expectation="batch_mean"))
 
 
 def test_alm_multiplier_of_unit_mean_shift_is_one():
-    _unit_mean_shift(AugmentedLagrangian(on="noisy", rho=0.05, c=1.0, expectation="batch_mean"))
+    _unit_mean_shift(AugmentedLagrangian(rho=0.05, c=1.0, expectation="batch_mean"))
 
 
 def test_multiplier_of_a_slack_mean_constraint_is_zero():
     g = waypoints(HalfSpace(vec(1.0), num(1.0)))  # E x <= 1 already holds for N(0, 1)
     _, states = langevin_chain(
-        PrimalDual(on="noisy", eta=0.05, expectation="batch_mean"),
+        PrimalDual(eta=0.05, expectation="batch_mean"),
         g,
         steps=100,
         batch=500,
@@ -85,7 +93,7 @@ def test_multiplier_of_a_slack_mean_constraint_is_zero():
 
 def test_noisy_primal_dual_step_is_the_papers_equations():
     x = vec(0.0, 3.0).reshape(2, 1, 1)
-    out, lam = PrimalDual(on="noisy", eta=0.5).step(
+    out, lam = PrimalDual(eta=0.5).step(
         _step(x, beta=0.2), UNIT_MEAN_SHIFT, vec(2.0, 0.4).reshape(2, 1)
     )
     # x - (beta / 2) lam dg with dg = -1; [lam + eta (1 - x)]_+
@@ -95,7 +103,7 @@ def test_noisy_primal_dual_step_is_the_papers_equations():
 
 def test_noisy_alm_step_is_the_papers_equations():
     x = vec(0.0, 3.0).reshape(2, 1, 1)
-    method = AugmentedLagrangian(on="noisy", rho=0.5, c=1.1)
+    method = AugmentedLagrangian(rho=0.5, c=1.1)
     init = method.init(x, UNIT_MEAN_SHIFT)._replace(lam=vec(2.0, 1.4).reshape(2, 1))
     out, state = method.step(_step(x, beta=0.2), UNIT_MEAN_SHIFT, init)
     torch.testing.assert_close(
@@ -107,7 +115,7 @@ def test_noisy_alm_step_is_the_papers_equations():
 
 def test_coefficient_one_does_not_scale_the_push_by_beta():
     x = vec(0.0).reshape(1, 1, 1)
-    out, _ = PrimalDual(on="noisy", coefficient="one").step(
+    out, _ = PrimalDual(coefficient="one").step(
         _step(x, beta=0.2), UNIT_MEAN_SHIFT, vec(2.0).reshape(1, 1)
     )
     assert float(out) == pytest.approx(2.0)
@@ -115,8 +123,14 @@ def test_coefficient_one_does_not_scale_the_push_by_beta():
 
 def test_batch_mean_keeps_one_multiplier_for_all_plans():
     x = normal(0, 5, 3, 2)
-    assert PrimalDual(expectation="batch_mean").init(x, waypoints(half_space())).shape == (1, 3)
-    assert PrimalDual(expectation="per_sample").init(x, waypoints(half_space())).shape == (5, 3)
+    assert CleanPrimalDual(expectation="batch_mean").init(x, waypoints(half_space())).shape == (
+        1,
+        3,
+    )
+    assert CleanPrimalDual(expectation="per_sample").init(x, waypoints(half_space())).shape == (
+        5,
+        3,
+    )
 
 
 @settings(max_examples=30, deadline=None)
@@ -139,20 +153,20 @@ def test_slack_is_never_negative_and_closes_g_only_where_the_multiplier_vanishes
 
 
 @pytest.mark.parametrize(
-    "method", [PrimalDual(), AugmentedLagrangian(rho=1.0)], ids=["primal-dual", "alm"]
+    "method", [CleanPrimalDual(), CleanAugmentedLagrangian(rho=1.0)], ids=["primal-dual", "alm"]
 )
 def test_clean_multiplier_of_one_half_space_is_exact_after_one_step(method):
     x = normal(2, 6, 4, 2, scale=2.0)
     g = waypoints(half_space(b=0.1))
     _, state = method.step(_step(x), g, method.init(x, g))
     out, _ = method.step(_step(x), g, state)
-    exact, _ = Projected().step(_step(x), g, None)
+    exact, _ = CleanProjected().step(_step(x), g, None)
     torch.testing.assert_close(out, exact, atol=1e-12, rtol=0)  # the same formula up to rounding
 
 
 @pytest.mark.parametrize(
     "method",
-    [PrimalDual(), PrimalDual(on="noisy"), AugmentedLagrangian(), AugmentedLagrangian(on="noisy")],
+    [CleanPrimalDual(), PrimalDual(), CleanAugmentedLagrangian(), AugmentedLagrangian()],
 )
 def test_pushes_leave_pinned_waypoints_alone(method):
     x = normal(3, 4, 5, 2, scale=2.0)
@@ -185,7 +199,7 @@ def test_unconstrained_ignores_g():
 )
 @pytest.mark.parametrize("on", ["clean", "noisy"])
 def test_projected_plans_satisfy_g(kind, on):
-    out = _plan(Projected(on=on), KINDS[kind], n=4)
+    out = _plan(make_method("projected", {"on": on}), KINDS[kind], n=4)
     assert (
         float(KINDS[kind](out).max()) <= 1e-6
     )  # the sequential and the secular solver stop at 1e-9; others are exact
@@ -194,15 +208,19 @@ def test_projected_plans_satisfy_g(kind, on):
 @pytest.mark.parametrize(
     ("method", "extra_steps", "most"),
     [
-        (Projected(), 0, 1e-12),  # exact
-        (AugmentedLagrangian(rho=1.0), 0, 1e-12),  # exact: the penalty step solves one half-space
+        (CleanProjected(), 0, 1e-12),  # exact
         (
-            AugmentedLagrangian(),
+            CleanAugmentedLagrangian(rho=1.0),
+            0,
+            1e-12,
+        ),  # exact: the penalty step solves one half-space
+        (
+            CleanAugmentedLagrangian(),
             10,
             1e-6,
         ),  # the penalty halves what is left at each frozen step: 0.02 / 2^10 and less
         (
-            PrimalDual(),
+            CleanPrimalDual(),
             60,
             1e-3,
         ),  # the push lags the multiplier by a step, so plans oscillate before they settle
@@ -236,7 +254,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
 
 @pytest.mark.parametrize(
     "method",
-    [Projected(), PrimalDual(), AugmentedLagrangian()],
+    [CleanProjected(), CleanPrimalDual(), CleanAugmentedLagrangian()],
     ids=["projected", "primal-dual", "alm"],
 )
 def test_clean_methods_go_round_a_disc_without_tearing(method):
@@ -249,8 +267,8 @@ def test_clean_methods_go_round_a_disc_without_tearing(method):
 
 @pytest.mark.parametrize("on", ["noisy", "estimate", "clean"])
 @pytest.mark.parametrize("expectation", ["per_sample", "batch_mean"])
-@pytest.mark.parametrize("kind", [PrimalDual, AugmentedLagrangian])
-def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expectation):
+@pytest.mark.parametrize("name", ["primal-dual", "alm"])
+def test_multipliers_of_segments_keep_their_places_and_pins_stay(name, on, expectation):
     x = torch.linspace(-1, 1, 12, dtype=F64)[None, :, None] + 0.1 * normal(8, 3, 12, 2)
     g = Constraint(
         (
@@ -258,7 +276,8 @@ def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expec
             OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),
         )
     )
-    method, pins = kind(on=on, expectation=expectation), pin(x, 0, -1)
+    method = make_method(name, {"on": on, "expectation": expectation})
+    pins = pin(x, 0, -1)
     state, sizes = method.init(x, g), set()
     for _ in range(4):
         sizes.add(getattr(state, "lam", state).shape)
@@ -273,7 +292,7 @@ def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expec
 
 
 @pytest.mark.parametrize(
-    "method", [PrimalDual(), AugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"]
+    "method", [CleanPrimalDual(), CleanAugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"]
 )
 def test_clean_duals_do_not_move_plans_that_are_safe_already(method):
     g = waypoints(half_space(b=50.0))
@@ -284,10 +303,10 @@ def test_every_method_meets_the_same_noise():
     g, seen = waypoints(half_space(b=50.0)), []
     for method in (
         Unconstrained(),
+        CleanProjected(),
         Projected(),
-        Projected(on="noisy"),
-        PrimalDual(on="noisy"),
-        AugmentedLagrangian(on="noisy"),
+        PrimalDual(),
+        AugmentedLagrangian(),
     ):
         noise = Noise([3, 4], (4, 2))
         like = torch.zeros(2, 4, 2)
@@ -308,9 +327,7 @@ def test_silu_replaces_g_by_its_smooth_positive_part_and_its_slope():
     leaf = x.clone().requires_grad_()
     smooth = torch.nn.functional.silu(g(leaf))
     (push,) = torch.autograd.grad(smooth, leaf, lam)
-    out, after = PrimalDual(on="noisy", eta=0.3, positive="silu", coefficient="one").step(
-        _step(x), g, lam
-    )
+    out, after = PrimalDual(eta=0.3, positive="silu", coefficient="one").step(_step(x), g, lam)
     torch.testing.assert_close(
         out, x - push, atol=1e-12, rtol=0
     )  # the written-out slope against autograd, float64
@@ -329,7 +346,7 @@ def test_silu_keeps_multipliers_finite_through_a_whole_plan(name):
 
 def test_alm_penalty_on_clean_stops_growing_at_one():
     x = normal(6, 2, 2, 2)
-    g, method = waypoints(half_space()), AugmentedLagrangian(c=3.0)
+    g, method = waypoints(half_space()), CleanAugmentedLagrangian(c=3.0)
     state = method.init(x, g)
     for _ in range(5):
         _, state = method.step(_step(x), g, state)
@@ -338,14 +355,67 @@ def test_alm_penalty_on_clean_stops_growing_at_one():
 
 def test_make_method_builds_each_of_them_with_its_defaults():
     assert {name: make_method(name, {}) for name in METHODS} == {
-        name: kind() for name, kind in METHODS.items()
+        "diffuser": Unconstrained(),
+        "guidance": Guidance(),
+        "conditional": Conditional(),
+        "best-of-k": BestOf(),
+        "final-projection": FinalProjection(),
+        "terminal": CleanProjected(correction="latent"),
+        "safediffuser": SafeDiffuser(),
+        "projected": CleanProjected(),
+        "primal-dual": CleanPrimalDual(),
+        "alm": CleanAugmentedLagrangian(),
     }
 
 
+def test_the_setting_on_picks_the_form_of_a_method():
+    assert {(name, on): make_method(name, {"on": on}) for name in FORMS for on in FORMS[name]} == {
+        ("projected", "noisy"): Projected(),
+        ("projected", "clean"): CleanProjected(),
+        ("primal-dual", "noisy"): PrimalDual(),
+        ("primal-dual", "estimate"): EstimatePrimalDual(),
+        ("primal-dual", "clean"): CleanPrimalDual(),
+        ("alm", "noisy"): AugmentedLagrangian(),
+        ("alm", "estimate"): EstimateAugmentedLagrangian(),
+        ("alm", "clean"): CleanAugmentedLagrangian(),
+    }
+    for name, forms in FORMS.items():
+        for on in forms:
+            assert make_method(name, {"on": on}).on == on
+
+
+def test_all_forms_of_a_method_have_the_same_defaults():
+    for name, forms in FORMS.items():
+        defaults = complete_settings(name, {})
+        for on in forms:
+            assert vars(make_method(name, {"on": on})).items() <= defaults.items()
+
+
+def test_settings_are_recorded_whole_whichever_form_uses_them():
+    assert complete_settings("projected", {"on": "noisy", "correction": "latent"}) == {
+        "on": "noisy",
+        "correction": "latent",
+    }
+    assert complete_settings("alm", {"rho": "2"}) == {
+        "on": "clean",
+        "rho": 2.0,
+        "c": 1.02,
+        "coefficient": "beta/2",
+        "expectation": "per_sample",
+        "positive": "none",
+    }
+    assert list(complete_settings("primal-dual", {})) == [
+        "on",
+        "eta",
+        "coefficient",
+        "expectation",
+        "positive",
+    ]
+    assert complete_settings("terminal", {}) == {}
+
+
 def test_make_method_reads_numbers_written_as_strings():
-    assert make_method("alm", {"rho": "0.25", "on": "noisy"}) == AugmentedLagrangian(
-        on="noisy", rho=0.25
-    )
+    assert make_method("alm", {"rho": "0.25", "on": "noisy"}) == AugmentedLagrangian(rho=0.25)
 
 
 @pytest.mark.parametrize(
@@ -374,7 +444,7 @@ def test_latent_correction_moves_the_sample_by_the_whole_projection():
     x = torch.full((1, 1, 1), 2.0)
     step = Step(x, x, 0.1, 0.8, lambda clean: clean / 2, Pins.none(x), False)
     g = waypoints(HalfSpace(torch.ones(1), torch.ones(())))
-    kernel, _ = Projected().step(step, g, None)
-    latent, _ = Projected(correction="latent").step(step, g, None)
+    kernel, _ = CleanProjected().step(step, g, None)
+    latent, _ = CleanProjected(correction="latent").step(step, g, None)
     assert float(kernel) == pytest.approx(0.5)
     assert float(latent) == pytest.approx(1.0 - 0.8)

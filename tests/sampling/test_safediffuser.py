@@ -14,7 +14,8 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.sampling.methods import Unconstrained, make_method
+from cdiff_cli.sampling import make_method
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.sampling.safediffuser import SafeDiffuser, _multipliers, jacobian, relaxation
 from cdiff_cli.sampling.sampler import Step, sample
 from tests.problems import (

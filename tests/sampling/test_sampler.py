@@ -13,8 +13,15 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.projection.project import project
-from cdiff_cli.sampling.kernels import KERNELS, ddim, ddpm, dpmpp_2m, half_log_snr, langevin
-from cdiff_cli.sampling.methods import AugmentedLagrangian, PrimalDual, Projected, Unconstrained
+from cdiff_cli.sampling import KERNELS, load_kernel
+from cdiff_cli.sampling.baselines import Unconstrained
+from cdiff_cli.sampling.clean_methods import (
+    CleanAugmentedLagrangian,
+    CleanPrimalDual,
+    CleanProjected,
+)
+from cdiff_cli.sampling.kernels import ddim, ddpm, dpmpp_2m, half_log_snr, langevin
+from cdiff_cli.sampling.methods import AugmentedLagrangian, Projected
 from cdiff_cli.sampling.noise import Noise
 from cdiff_cli.sampling.sampler import sample
 from cdiff_cli.training.loss import Weighing, training_loss
@@ -70,7 +77,9 @@ def test_ddpm_narrows_to_the_true_std_with_more_steps():
 
 
 def test_all_kernels_are_named():
-    assert {"ddpm": ddpm, "ddim": ddim, "dpm++2m": dpmpp_2m, "langevin": langevin} == KERNELS
+    assert {"ddpm": ddpm, "ddim": ddim, "dpm++2m": dpmpp_2m, "langevin": langevin} == {
+        name: load_kernel(name) for name in KERNELS
+    }
 
 
 @settings(max_examples=30, deadline=None)
@@ -284,7 +293,7 @@ def test_on_step_sees_the_plan_that_is_returned():
 def test_frozen_steps_let_the_multipliers_finish():
     def violation(extra_steps):
         return float(
-            waypoints(half_space())(_record(extra_steps, AugmentedLagrangian(rho=0.1))[0])
+            waypoints(half_space())(_record(extra_steps, CleanAugmentedLagrangian(rho=0.1))[0])
             .clamp_min(0)
             .sum()
         )
@@ -295,7 +304,7 @@ def test_frozen_steps_let_the_multipliers_finish():
 
 @pytest.mark.parametrize("kernel", list(KERNELS))
 @pytest.mark.parametrize(
-    "method", [Unconstrained(), Projected(), Projected(on="noisy"), AugmentedLagrangian(on="noisy")]
+    "method", [Unconstrained(), CleanProjected(), Projected(), AugmentedLagrangian()]
 )
 def test_pins_hold_exactly_at_every_step(kernel, method):
     schedule = Schedule.cosine(10)
@@ -315,13 +324,15 @@ def test_pins_hold_exactly_at_every_step(kernel, method):
         waypoints(half_space()),
         pins,
         draws(2, 2, 4, 2),
-        kernel=KERNELS[kernel],
+        kernel=load_kernel(kernel),
         extra_steps=2,
         on_step=check,
     )
 
 
-@pytest.mark.parametrize("method", [Projected(), PrimalDual(), AugmentedLagrangian()])
+@pytest.mark.parametrize(
+    "method", [CleanProjected(), CleanPrimalDual(), CleanAugmentedLagrangian()]
+)
 def test_the_next_step_knows_the_estimate_that_was_used_not_the_network_s(method):
     given = []
 
@@ -345,7 +356,7 @@ def test_the_next_step_knows_the_estimate_that_was_used_not_the_network_s(method
 @pytest.mark.parametrize("n_steps", [1, 2, 12])
 def test_frozen_steps_of_dpm_2m_are_clean_estimates_that_obey(n_steps):
     g = waypoints(half_space(b=-0.3))
-    _, calls, seen = _record(3, Projected(), dpmpp_2m, b=-0.3, n_steps=n_steps)
+    _, calls, seen = _record(3, CleanProjected(), dpmpp_2m, b=-0.3, n_steps=n_steps)
     assert len(calls) == n_steps + 3
     for _, step, out in seen[n_steps - 1 :]:
         torch.testing.assert_close(
@@ -384,7 +395,7 @@ def test_a_chain_split_in_two_with_the_state_handed_on_is_the_whole_chain():
     """Frozen steps alone: 3 + 4 of them, begun where the first 3 ended, are 7."""
     schedule, like = Schedule.cosine(1), torch.zeros(2, 3, 2, dtype=F64)
     denoiser = gaussian_denoiser(schedule, MEAN, STD)
-    method, g, x = PrimalDual(eta=0.3), waypoints(half_space(b=-1.0)), normal(3, 2, 3, 2)
+    method, g, x = CleanPrimalDual(eta=0.3), waypoints(half_space(b=-1.0)), normal(3, 2, 3, 2)
 
     def go(first, frozen, state=None):
         return sample(
@@ -425,7 +436,7 @@ def test_the_plan_of_a_seed_does_not_depend_on_its_neighbours():
         return sample(
             gaussian_denoiser(schedule, MEAN, STD),
             schedule,
-            AugmentedLagrangian(),
+            CleanAugmentedLagrangian(),
             g,
             Pins.none(like),
             Noise(seeds, (3, 2)),

@@ -12,9 +12,16 @@ from hypothesis import strategies as st
 
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.normaliser import Normaliser
+from cdiff_cli.tasks.ball_run.task import BALL_RUN
 from cdiff_cli.tasks.maze2d import LARGE, UMAZE
 from cdiff_cli.tasks.mujoco.locomotion import HOPPER
-from cdiff_cli.training.demonstrations import demonstrations, digest, load_dataset, load_inputs
+from cdiff_cli.training.demonstrations import (
+    demonstrations,
+    digest,
+    generating_files,
+    load_dataset,
+    load_inputs,
+)
 from cdiff_cli.training.windows import Windows
 
 LAYOUT = ("x", "y", "vx", "vy")
@@ -235,6 +242,19 @@ def test_altered_demonstrations_are_generated_anew(own_minari):
     assert digest(again) == digest(first)
 
 
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        (UMAZE, ["maze2d.py"]),
+        (BALL_RUN, ["__init__.py", "env.py", "obstacles.py", "task.py"]),
+        (HOPPER, ["__init__.py", "gait_search.py", "locomotion.py", "expert.json"]),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_demonstrations_depend_on_the_modules_of_their_task_and_its_expert(task, expected):
+    assert [file.name for file in generating_files(task)] == expected
+
+
 def test_the_digest_sees_lengths_and_values():
     a = np.arange(8.0).reshape(4, 2)
     assert digest([a]) == digest([a.copy()])
@@ -340,10 +360,12 @@ def test_a_missing_file_is_called_missing(tmp_path):
 
 @pytest.mark.usefixtures("own_minari")
 def test_a_missing_minari_dataset_is_answered_with_those_that_are_here():
-    with pytest.raises(CdiffError, match=r'no local Minari dataset "D4RL/x-v1".*here are: none'):
+    with pytest.raises(
+        CdiffError, match=r'no local Minari dataset "D4RL/x-v1".*local datasets: none'
+    ):
         load_dataset(UMAZE, "D4RL/x-v1")
     demonstrations(UMAZE, 20, 0)
-    with pytest.raises(CdiffError, match=r"here are: cdiff/maze2d-umaze-v0.*minari download"):
+    with pytest.raises(CdiffError, match=r"local datasets: cdiff/maze2d-umaze-v0.*minari download"):
         load_dataset(UMAZE, "D4RL/x-v1")
 
 

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 import cdiff_cli.machine
 import cdiff_cli.models.checkpoint
-import cdiff_cli.training.fit
+import cdiff_cli.training.state
 import cdiff_cli.training.system_identification
 from cdiff_cli.errors import CdiffError, CheckpointError
 from cdiff_cli.machine import choose_device
@@ -34,7 +34,8 @@ from cdiff_cli.models.recipe import (
 )
 from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.maze2d import UMAZE
-from cdiff_cli.training.fit import data_statistics, train
+from cdiff_cli.training.data_statistics import data_statistics
+from cdiff_cli.training.fit import train
 from cdiff_cli.training.windows import end_pins
 from cdiff_cli.yaml_files import load
 
@@ -122,7 +123,7 @@ def test_interrupted_training_resumes_to_the_same_bits(whole, step, error, tmp_p
 @pytest.mark.parametrize(
     ("place", "save_every"),
     [
-        ("cdiff_cli.training.fit.training_loss", 500),
+        ("cdiff_cli.training.state.training_loss", 500),
         ("torch.nn.utils.clip_grad_norm_", 500),
         ("torch.optim.Adam.step", 2),
     ],
@@ -131,7 +132,7 @@ def test_interruption_within_a_step_resumes_to_the_same_bits(whole, place, save_
     """Ctrl-C nearly always falls here: after the random numbers of a step are drawn, before its update is whole."""
     module, _, name = place.rpartition(".")
     owner = {
-        "cdiff_cli.training.fit": cdiff_cli.training.fit,
+        "cdiff_cli.training.state": cdiff_cli.training.state,
         "torch.nn.utils": torch.nn.utils,
         "torch.optim.Adam": torch.optim.Adam,
     }[module]
@@ -207,7 +208,7 @@ def test_loss_decreases(tmp_path):
 
 def test_a_loss_that_is_no_number_is_an_error(tmp_path, monkeypatch):
     nan = torch.tensor(float("nan"), requires_grad=True)
-    monkeypatch.setattr(cdiff_cli.training.fit, "training_loss", lambda *_: (nan, nan.detach()))
+    monkeypatch.setattr(cdiff_cli.training.state, "training_loss", lambda *_: (nan, nan.detach()))
     with pytest.raises(
         CdiffError, match="the loss is nan at step 0: training diverged; lower learning_rate"
     ):
@@ -428,8 +429,9 @@ def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
 
 def test_dynamics_that_explain_too_little_are_not_kept(monkeypatch, tmp_path):
     """Plans would be held to them; the card still says how much they explain."""
-    poor = cdiff_cli.training.system_identification.fit
-    monkeypatch.setattr(cdiff_cli.training.fit, "fit", lambda *data: (poor(*data)[0], 0.98))
+    module = cdiff_cli.training.system_identification
+    fitted = module.fit
+    monkeypatch.setattr(module, "fit", lambda *data: (fitted(*data)[0], 0.98))
     checkpoint = fit(tmp_path)
     assert checkpoint.dynamics is None
     assert checkpoint.card.linear == 0.98

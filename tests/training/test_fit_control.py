@@ -51,7 +51,7 @@ def test_a_checkpoint_of_a_control_task_holds_frame_and_inverse_dynamics(trained
     checkpoint = trained[0]
     assert checkpoint.frame is not None
     assert checkpoint.frame.mean.shape == (16, 4)
-    assert checkpoint.frame.seen.tolist() == [False, True, True, True]
+    assert checkpoint.frame.used.tolist() == [False, True, True, True]
     assert checkpoint.inverse is not None
     assert set(checkpoint.card.inverse) == {"windows", "branches"}
     x = checkpoint.demonstrations.double()

@@ -169,7 +169,7 @@ def test_a_recipe_that_does_not_fit_the_condition_is_one_clear_line(spec, asked,
 @pytest.mark.usefixtures("place")
 def test_a_base_of_another_network_or_other_data_is_refused(tmp_path):
     wider = LABELLED.network.model_copy(update={"width": 16})
-    with pytest.raises(CheckpointError, match="its network is not the one of this recipe"):
+    with pytest.raises(CheckpointError, match="its network differs from the one of this recipe"):
         fit(tmp_path / "a", LABELLED.model_copy(update={"network": wider}), condition=condition())
 
 

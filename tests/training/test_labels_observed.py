@@ -124,7 +124,7 @@ def test_the_obstacle_of_a_label_goes_on_as_it_is_seen_to(condition):
     assert condition.label(straight(), seen(5.0, 0.0, -3.0, 0.0), DT)[0, 0] == -1.0
 
 
-def test_quantities_are_told_relative_to_the_coordinate_they_are_called_after():
+def test_network_gets_quantities_relative_to_the_coordinate_they_are_mapped_to():
     names, layout = ("obstacle.x", "obstacle.vy", "wind"), ("x", "y", "vx", "vy")
     telling = ObservationEncoder(
         torch.tensor([0, 3, -1]), torch.zeros(3), torch.tensor([2.0, 1.0, 1.0])
@@ -138,7 +138,9 @@ def test_quantities_are_told_relative_to_the_coordinate_they_are_called_after():
         torch.randn(3, 500, generator=generator(0)).double(),
         torch.randn(500, 4, generator=generator(1)).double(),
     )
-    fitted = ObservationEncoder.fit(names, layout, list(values), states)
+    fitted = ObservationEncoder.fit(
+        names, layout, {"obstacle.x": "x", "obstacle.vy": "vy"}, list(values), states
+    )
     assert fitted.columns.tolist() == [0, 3, -1]
     told = fitted(list(values), states)
     torch.testing.assert_close(told.mean(0), torch.zeros(3), atol=1e-5, rtol=0)  # float32

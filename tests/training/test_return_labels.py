@@ -84,7 +84,7 @@ def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknow
         label[50, 1], torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0
     )  # float32; a middling return is told too
     assert label[:, 2:].abs().max() == 0
-    assert returns.told(DISCOUNT) == {
+    assert returns.record(DISCOUNT) == {
         "discount": 0.75,
         "low": 0.02,
         "high": 0.98,
@@ -97,9 +97,9 @@ def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknow
     [
         (
             np.full(10, 0.3),
-            "all demonstrations return the same, 0.3 a step: there is no better one to ask for",
+            "all demonstrations return the same, 0.3 per step, so that none is better",
         ),
-        (np.zeros(10), "all demonstrations return the same, 0 a step"),
+        (np.zeros(10), "all demonstrations return the same, 0 per step"),
         (
             np.arange(3.0),
             r"no demonstration is 4 steps long, as a return at discount 0\.75 needs; lower the discount",
@@ -134,14 +134,14 @@ def test_rewards_of_a_file_are_cut_like_its_states(tmp_path):
     [
         (
             {"actions": np.zeros(6)},
-            "it needs rewards and timeouts, for its recipe conditions the planner on the return",
+            "it needs rewards and timeouts, because its recipe conditions the planner on the return",
         ),
         (
             {"rewards": np.full(6, np.nan)},
             "rewards hold NaN or inf; repair or choose another dataset",
         ),
-        ({"rewards": np.zeros((6, 2))}, "rewards of 12 steps for 6 states; expected one a step"),
-        ({"rewards": np.zeros(4)}, "rewards of 4 steps for 6 states; expected one a step"),
+        ({"rewards": np.zeros((6, 2))}, "rewards of 12 steps for 6 states; expected one per step"),
+        ({"rewards": np.zeros(4)}, "rewards of 4 steps for 6 states; expected one per step"),
         (
             {"rewards": np.zeros(6), "timeouts": [0, 0, 0, 1, 0, 0]},
             "2 episodes of rewards for 1 of states",

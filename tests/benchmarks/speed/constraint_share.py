@@ -13,7 +13,7 @@ from pathlib import Path
 from cdiff_cli.commands.experiment import Request
 from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.sampling.methods import METHODS
+from cdiff_cli.sampling import METHODS
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--task", default="maze2d-umaze")

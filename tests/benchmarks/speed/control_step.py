@@ -63,7 +63,7 @@ def paper_sized(acting: Controller, net: TemporalUnet, horizon: int) -> Controll
         return shipped(x[:, :own], t)[:, tau]
 
     longer = ResidualNormaliser(
-        frame.state, frame.seen, frame.mean[tau], frame.gain[tau], frame.scale[tau]
+        frame.state, frame.used, frame.mean[tau], frame.gain[tau], frame.scale[tau]
     )
     planner = replace(planner, normaliser=longer, denoiser=denoiser, horizon=horizon)
     return replace(acting, planner=planner)

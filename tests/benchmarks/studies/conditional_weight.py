@@ -19,7 +19,7 @@ from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling.baselines import Unconstrained
 
 WHOLE = ("weight", "violation / g", "of diffuser", "worst / g", "distance / m", "torn", "in wall")
 CONTROL = (

@@ -23,8 +23,8 @@ from cdiff_cli.commands.rollout import controller
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.planning.receding_horizon import Controller
 from cdiff_cli.training.demonstrations import demonstrations, load_inputs
-from cdiff_cli.training.fit import fit_dynamics
 from cdiff_cli.training.inverse_dynamics import fit_inverse
+from cdiff_cli.training.system_identification import fit_dynamics
 
 NAME = "ball-run"
 

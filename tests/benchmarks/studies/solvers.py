@@ -22,8 +22,9 @@ from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.open_loop import plan
-from cdiff_cli.sampling.kernels import KERNELS, half_log_snr
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling import load_kernel
+from cdiff_cli.sampling.baselines import Unconstrained
+from cdiff_cli.sampling.kernels import half_log_snr
 from cdiff_cli.sampling.sampler import sample
 
 CALLS = (5, 8, 16, 32)
@@ -62,7 +63,7 @@ def end(law, schedule, kernel):
         Constraint(()),
         Pins.none(x),
         lambda: x,
-        kernel=KERNELS[kernel],
+        kernel=load_kernel(kernel),
     ).x
 
 

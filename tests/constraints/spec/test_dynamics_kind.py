@@ -165,7 +165,7 @@ MISTAKES = {
     ),
     "no kind": (
         item("name: own"),
-        "4 constraints[1]: it has no kind; add `kind: linear`, `quadratic`, `dcbf` or `dynamics`",
+        "4 constraints[1]: it has no kind; add `kind: linear` or another",
     ),
     "unknown kind": (
         item("kind: dynamic"),
