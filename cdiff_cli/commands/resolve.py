@@ -232,7 +232,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
             "sampler.return_weight": 0.0
             if method.planner == "conditional"
             else loaded.return_weight,
-            "control.env": tuple(sorted(request.env)),
+            "control.env": tuple(sorted(request.env or own.control.env)),
             "methods": {request.method: complete_settings(request.method, constants)},
         }
     )
@@ -242,7 +242,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
         "sampler.extra_steps": request.extra_steps,
         "control.execute": request.execute,
         "control.warm_start": request.warm,
-        "control.action_noise": request.action_noise,
+        "control.action_noise": request.action_noise or None,
         "enforce.dynamics": False if request.no_dynamics else None,
         "methods": {request.method: complete_settings(request.method, chosen)},
     }

@@ -1,5 +1,6 @@
 """Presets of a recipe: kernel and steps, how they are checked and what a command makes of them."""
 
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -8,7 +9,7 @@ from cdiff_cli.commands.experiment import Request
 from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.preset import SamplerSettings
-from cdiff_cli.models.recipe import Recipe
+from cdiff_cli.models.recipe import Recipe, load_recipe
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
@@ -101,3 +102,21 @@ def test_a_bad_kernel_or_number_of_steps_in_a_preset_is_one_clear_line(wrong, co
         recipe(tmp_path, PRESETS.replace(*wrong))
     assert complaint in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_a_preset_says_of_control_is_used_and_options_win_over_it(monkeypatch):
+    shipped = load_recipe("ball-run")
+    said = {"control.action_noise": 0.1, "control.env": ["pattern=leader"], "control.execute": 2}
+    noisy = shipped.model_copy(
+        update={"presets": {"noisy": shipped.presets["recommended"].updated(said)}}
+    )
+    monkeypatch.setattr("cdiff_cli.commands.resolve.load_recipe", lambda _: noisy)
+    asked = Request(task="ball-run", preset="noisy")
+    one = resolve(asked)
+    control = one.preset.control
+    assert (control.action_noise, control.env, control.execute) == (0.1, ("pattern=leader",), 2)
+    assert not one.changed
+    other = resolve(replace(asked, action_noise=0.2, env=("pattern=chaser",), execute=1))
+    control = other.preset.control
+    assert (control.action_noise, control.env, control.execute) == (0.2, ("pattern=chaser",), 1)
+    assert other.changed
