@@ -1,4 +1,4 @@
-"""From a request to an experiment: names found, planner loaded, constraints compiled, ends checked."""
+"""From a request to an experiment: find, load, decide, compile, check, in that order."""
 
 import math
 from collections.abc import Sequence
@@ -81,7 +81,7 @@ def resolve(request: Request) -> Experiment:
     )
 
 
-# 1. Names exist, options apply ---------------------------------------------------------------------
+# 1. Names exist, options apply --------------------------------------------------------------------
 
 
 def find(request: Request) -> tuple[Task, Recipe]:
@@ -129,12 +129,12 @@ def _refuse_ignored_options(request: Request, control: bool) -> None:
         )
 
 
-# 2. The planner: a checkpoint, or an exact score ---------------------------------------------------
+# 2. The planner: a checkpoint, or an exact score --------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A planner with its trained schedule, and the checkpoint it is from; None for an exact score."""
+    """A planner with its trained schedule, and its checkpoint; None for an exact score."""
 
     planner: Planner
     checkpoint: Checkpoint | None
@@ -205,7 +205,7 @@ def load_conditional(
     return found
 
 
-# 3. The preset and the method ----------------------------------------------------------------------
+# 3. The preset and the method ---------------------------------------------------------------------
 
 
 def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Preset, Method]:
@@ -264,7 +264,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-# 4. The constraints --------------------------------------------------------------------------------
+# 4. The constraints -------------------------------------------------------------------------------
 
 
 def compile_constraints(
@@ -328,7 +328,7 @@ def margins_for(
     return choose_margins(known, weights, path.stem, content, request.method, preset)
 
 
-# 5. Start and goal ---------------------------------------------------------------------------------
+# 5. Start and goal --------------------------------------------------------------------------------
 
 
 def ends(

@@ -35,7 +35,7 @@ from cdiff_cli.planning.execution import Rollout, follow
 from cdiff_cli.planning.receding_horizon import Controller, rollout
 from cdiff_cli.tasks.protocol import Brakes, ControlTask, HasEnvOptions, Task, Tracks
 
-# Whole plans ---------------------------------------------------------------------------------------
+# Whole plans --------------------------------------------------------------------------------------
 
 
 def rollout_run(
@@ -95,7 +95,7 @@ def _write_executed(path: Path, experiment: Experiment, executed: Rollout) -> No
     np.savez_compressed(path / "rollout.npz", **arrays)
 
 
-# Control tasks -------------------------------------------------------------------------------------
+# Control tasks ------------------------------------------------------------------------------------
 
 
 def control_run(

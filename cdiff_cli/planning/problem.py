@@ -15,7 +15,7 @@ from cdiff_cli.models.planner import Planner
 from cdiff_cli.tasks.protocol import HasMap, Task, Tolerances
 
 POLISH_MARGIN = 1e-6
-"""The final projection tightens g by this, environment units; larger than every solver's tolerance."""
+"""Margin of the final projection, environment units; larger than every solver's tolerance."""
 
 
 DEFAULT_TOLERANCES = Tolerances()
@@ -70,7 +70,7 @@ class Problem:
 def check_feasible(problem: Problem, task: Task | None = None) -> None:
     """Refuse a start or goal inside a wall of the task or outside the constraints.
 
-    Raises CdiffError, or InfeasibleError where a constraint is the reason, before anything is sampled.
+    Raises CdiffError, or InfeasibleError where a constraint is the reason.
     """
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):

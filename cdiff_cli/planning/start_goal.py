@@ -16,7 +16,10 @@ from cdiff_cli.models.recipe import Card
 def parse_state(
     flag: str, text: str | None, default: dict[str, float] | None, task: Any
 ) -> Array | None:
-    """'0.3,-1.2' (the positions, at rest) or 'x=0.3,y=-1.2,vx=1' as a state [dim]; coordinates left out are 0."""
+    """The state [dim] of '0.3,-1.2' (the positions, at rest) or 'x=0.3,y=-1.2,vx=1'.
+
+    Coordinates left out are 0. Raises CdiffError for unknown names and for what is no number.
+    """
     if text is None and default is None:
         return None
     values = dict(default or {}) if text is None else {}
@@ -25,7 +28,8 @@ def parse_state(
         name = name.strip() if equals else task.positions[i] if i < len(task.positions) else ""
         if name not in task.layout:
             raise CdiffError(
-                f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} as 0.3,-1.2 or x=0.3,y=-1.2'
+                f'{flag}: no coordinate "{name or piece}"; expected {",".join(task.positions)} '
+                "as 0.3,-1.2 or x=0.3,y=-1.2"
             )
         try:
             values[name] = float(number)
@@ -34,7 +38,8 @@ def parse_state(
     missing = [name for name in task.positions if name not in values]
     if missing:
         raise CdiffError(
-            f"{flag}: {', '.join(missing)} missing; give {','.join(task.positions)}, as {flag} 0.3,-1.2"
+            f"{flag}: {', '.join(missing)} missing; "
+            f"give {','.join(task.positions)}, as {flag} 0.3,-1.2"
         )
     state = np.array([values.get(name, 0.0) for name in task.layout])
     if not np.isfinite(state).all():
@@ -43,7 +48,7 @@ def parse_state(
 
 
 def fastest(task: Any, g: Constraint) -> float:
-    """The speed that limits on the change of the positions allow, m/s."""
+    """The largest speed that limits on the rate of the positions allow, m/s; inf without any."""
     at = {task.layout.index(name) for name in task.positions}
     own = [
         part.high
@@ -54,8 +59,11 @@ def fastest(task: Any, g: Constraint) -> float:
 
 
 def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
-    """n random feasible starts and goals [n, dim], at rest: both allowed by the constraints, and the shortest way between
-    them no faster over one horizon than 95 % of the data's windows.
+    """n random feasible starts and goals [n, dim], at rest.
+
+    The constraints allow both, and the shortest way between them asks for no more speed over one
+    horizon than 95 % of the data's windows have.
+    Raises CdiffError where 100 000 draws hold too few.
     """
     rng, starts, goals = np.random.default_rng(seed), [], []
     still = np.zeros(len(task.layout) - len(task.positions))
@@ -72,5 +80,6 @@ def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tup
             if len(starts) == n:
                 return np.stack(starts), np.stack(goals)
     raise CdiffError(
-        "no feasible pair of start and goal in 100000 draws: the constraints leave too little of the maze"
+        "no feasible pair of start and goal in 100000 draws: "
+        "the constraints leave too little of the maze"
     )
