@@ -18,7 +18,7 @@ from cdiff_cli.models.adapters import (
     from_velocity,
 )
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.sampling.methods import Unconstrained
+from cdiff_cli.sampling.baselines import Unconstrained
 from cdiff_cli.sampling.sampler import sample
 from tests.problems import F64, draws, gaussian_denoiser, normal
 
