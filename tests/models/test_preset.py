@@ -37,7 +37,7 @@ def test_updated_with_nothing_is_the_preset_itself():
         ("sampler.kernel", "euler"),
         ("sampler.steps", 0),
         ("sampler.extra_steps", -1),
-        ("sampler.temperature", 0.0),
+        ("sampler.temperature", -0.1),
         ("sampler.temperature", 1.5),
         ("sampler.return_weight", -1.0),
         ("control.execute", 0),
