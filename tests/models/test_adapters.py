@@ -1,4 +1,4 @@
-"""Networks made elsewhere as denoisers, by the exact score of a Gaussian, which every parametrisation can state."""
+"""Networks trained elsewhere as denoisers: every parametrisation of a Gaussian's exact score."""
 
 import math
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ STEPS = (1, 7, 20)
 
 
 def levels_of(t):
-    """alpha_bar of the steps that a network is given, counted from 0 for the least noise [n, 1, 1]."""
+    """alpha_bar of the steps that a network is given, 0 for the least noise [n, 1, 1]."""
     return torch.tensor(LEVELS, dtype=F64)[t][:, None, None]
 
 
@@ -122,7 +122,7 @@ def test_plans_by_noise_and_by_clean_estimate_are_the_same():
     torch.testing.assert_close(plans(ADAPTED["epsilon"]), plans(EXACT), atol=1e-8, rtol=0)
 
 
-# diffusers ------------------------------------------------------------------------------------------------------------
+# diffusers ----------------------------------------------------------------------------------------
 
 PREDICTIONS = {
     "epsilon": predicts_noise,
@@ -132,7 +132,7 @@ PREDICTIONS = {
 
 
 def unet(network, wrapped):
-    """A network with the interface of diffusers' UNet1DModel: channels first, its output wrapped."""
+    """A network with the interface of diffusers' UNet1DModel: channels first, output wrapped."""
 
     def call(x, t):
         assert x.shape[1:] == (2, 5)
@@ -175,7 +175,7 @@ def test_another_prediction_type_is_refused():
         from_diffusers(unet(predicts_noise, True), scheduler("flow_prediction"))
 
 
-# wrappers -------------------------------------------------------------------------------------------------------------
+# wrappers -----------------------------------------------------------------------------------------
 
 
 def test_clipped_keeps_what_is_within_the_limit_and_cuts_the_rest():
@@ -198,7 +198,7 @@ def test_batched_is_equal_to_the_whole_and_calls_with_no_more_than_its_size(size
     assert max(sizes) == min(size, 7)
 
 
-# schedules ------------------------------------------------------------------------------------------------------------
+# schedules ----------------------------------------------------------------------------------------
 
 
 def test_a_schedule_of_its_own_levels_is_itself():

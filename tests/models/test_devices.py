@@ -1,7 +1,8 @@
-"""One code path for every device: what runs at a diffusion step, or once a plan, makes no tensor on a device that it does not name.
+"""One code path for every device: code that runs per diffusion step or per plan names its device.
 
-Without a GPU: the default device is one whose tensors hold nothing, so that a tensor made there cannot be used. What is made on the
-host on purpose and then kept, as the solvers' matrices, is made by a first call.
+No GPU is needed: the default device is one whose tensors hold nothing, so a tensor made there
+cannot be used. What is made on the host on purpose and kept, such as the solvers' matrices, is
+made by a first call.
 """
 
 from pathlib import Path

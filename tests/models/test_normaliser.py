@@ -79,7 +79,7 @@ def test_the_residual_network_hands_the_present_state_back():
 
 @pytest.fixture(scope="module")
 def fitted():
-    """Forty long episodes and twenty short ones of the linear system, its inverse dynamics fitted."""
+    """Forty long and twenty short episodes of the linear system, its inverse dynamics fitted."""
     pairs = [episode(seed, 100 if seed < 40 else 5) for seed in range(60)]
     spec = InverseSpec(width=64, steps=400, batch=256, learning_rate=3e-3)
     episodes, inputs = zip(*pairs, strict=True)

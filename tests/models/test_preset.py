@@ -1,4 +1,4 @@
-"""Presets as values: single fields changed, one method's share, what plans depend on, and `like` in a recipe."""
+"""Presets as values: changed fields, one method's share, facts, and `like` in a recipe."""
 
 import pytest
 from pydantic import ValidationError
@@ -16,7 +16,7 @@ PRESET = Preset(
 )
 
 
-# updated --------------------------------------------------------------------------------------------------------------
+# updated ------------------------------------------------------------------------------------------
 
 
 def test_updated_changes_the_named_fields_alone():
@@ -37,7 +37,7 @@ def test_updated_with_nothing_is_the_preset_itself():
         ("sampler.kernel", "euler"),
         ("sampler.steps", 0),
         ("sampler.extra_steps", -1),
-        ("sampler.temperature", 0.0),
+        ("sampler.temperature", -0.1),
         ("sampler.temperature", 1.5),
         ("sampler.return_weight", -1.0),
         ("control.execute", 0),
@@ -53,7 +53,7 @@ def test_updated_checks_what_it_is_given(name, value):
         PRESET.updated({name: value})
 
 
-# one method -----------------------------------------------------------------------------------------------------------
+# one method ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_extra_steps_of_other_methods_make_no_difference():
     assert PRESET.of_method("alm") == other.of_method("alm")
 
 
-# facts ----------------------------------------------------------------------------------------------------------------
+# facts --------------------------------------------------------------------------------------------
 
 
 def test_facts_name_the_method_its_settings_and_every_field_but_margins():
@@ -106,7 +106,7 @@ def test_differences_name_the_facts_that_differ_in_both_directions():
     assert alm.differences(PRESET.of_method("projected")) == ["method", "settings", "extra_steps"]
 
 
-# like -----------------------------------------------------------------------------------------------------------------
+# like ---------------------------------------------------------------------------------------------
 
 BASE = """presets:
   first:

@@ -82,17 +82,20 @@ def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
     [
         (
             ("dpm++2m", "dpm2m"),
-            "presets.fast.sampler.kernel: expected 'ddpm', 'ddim', 'dpm++2m' or 'langevin', found 'dpm2m'",
+            "presets.fast.sampler.kernel: "
+            "expected 'ddpm', 'ddim', 'dpm++2m' or 'langevin', found 'dpm2m'",
         ),
         (("6", "0"), "presets.fast.sampler.steps: expected greater than or equal to 1, found 0"),
         (("6", "-3"), "presets.fast.sampler.steps: expected greater than or equal to 1, found -3"),
         (
             ("6", "2.5"),
-            "presets.fast.sampler.steps: expected a valid integer, got a number with a fractional part, found 2.5",
+            "presets.fast.sampler.steps: "
+            "expected a valid integer, got a number with a fractional part, found 2.5",
         ),
         (
             ("6", "many"),
-            "presets.fast.sampler.steps: expected a valid integer, unable to parse string as an integer, found 'many'",
+            "presets.fast.sampler.steps: "
+            "expected a valid integer, unable to parse string as an integer, found 'many'",
         ),
         (("6", "65"), "presets.fast.sampler.steps: expected 1 to 64 (n_steps), found 65"),
     ],
