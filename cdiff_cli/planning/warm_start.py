@@ -1,4 +1,4 @@
-"""What a plan of receding-horizon control takes over from the last one: the plan itself, moved on, and the multipliers."""
+"""Warm start of receding-horizon control: the last plan and its multipliers, moved forward."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +17,15 @@ from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 
 def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
-    """The last plans, environment units, moved on by the steps executed, from the centre of the present frame. What they do not
-    reach goes on as the frame foresees, at 0: a last waypoint repeated is a robot that stops, which few steps of denoising believe.
+    """Move the last plans forward by the executed steps.
+
+    The result is relative to the centre of the present normaliser. The waypoints beyond the end of
+    the last plans are 0, which is the normaliser's linear prediction. A repeated last waypoint
+    would be a robot that stops, and the few denoising steps of a warm start do not undo that.
+
+    to      normaliser at the present states
+    last    last plans, environment units   [batch, horizon, dim]
+    steps   executed steps
     """
     y = torch.from_numpy(np.concatenate((last[:, steps:], last[:, :steps]), 1)) - to.centre
     y[:, -steps:] = 0.0
@@ -26,13 +33,15 @@ def shift_plan(to: Normaliser, last: NDArray[np.float64], steps: int) -> Tensor:
 
 
 def carry(method: Method, last: Any, g: Constraint, x: Traj, executed: int) -> Any:
-    """State that the method begins the next plan with: fresh, but with the multipliers that the last plan ended with.
+    """State that the method begins the next plan with: fresh but for the last plan's multipliers.
 
-    The multipliers move forward by the executed waypoints, block by block, and those of the new waypoints begin at zero.
-    Begun at zero altogether, they would have to be found again in the few steps of a warm-started plan.
-    A penalty weight begins anew. Multipliers of another number of rows or plans are dropped.
+    The multipliers move forward by the executed waypoints, block by block, and those of the new
+    waypoints begin at zero. Begun at zero altogether, they would have to be found again in the few
+    steps of a warm-started plan. A penalty weight begins anew. Multipliers of another number of
+    rows or plans are dropped.
 
-    last       state after the last step of the last plan, of the same plans in the same order; None: begin afresh
+    last       state after the last step of the last plan, of the same plans in the same order;
+               None: begin afresh
     g          the constraint that sample() is given
     x          any tensor of the plans' shape [batch, horizon, dim], type and device
     executed   waypoints by which the present plan begins later than the last
@@ -63,7 +72,7 @@ def select(state: Any, plans: NDArray[np.bool_]) -> Any:
 def _moved(
     method: Method, fresh: Rows, last: Any, g: Constraint, horizon: int, executed: int
 ) -> Rows:
-    """The last multipliers moved forward block by block; new rows at the end of a block stay as in `fresh`."""
+    """The last multipliers moved forward block by block; rows new to a block are as in `fresh`."""
     if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
         return fresh
     out = fresh.clone()
@@ -76,10 +85,10 @@ def _moved(
 
 @dataclass
 class CarriedMultipliers:
-    """The method, begun with the multipliers that the last plan ended with, moved on by `tighten` waypoints: reset, they would have
-    to be found again in the few steps of a warm plan.
+    """A method that begins with carry() and keeps its last state itself, until the controller does.
 
-    state   of the method after its last step; None to begin anew
+    shift   executed waypoints
+    state   state after the last step; None: begin afresh
     """
 
     method: Method
