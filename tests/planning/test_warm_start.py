@@ -1,4 +1,6 @@
-"""Multipliers carried from one plan to the next: each lands on the row that it belonged to, moved on by the steps executed."""
+"""Multipliers carried from one plan to the next: each lands on the row that it belonged to, moved
+on by the steps executed.
+"""
 
 import numpy as np
 import pytest
@@ -80,7 +82,9 @@ def test_selected_plans_keep_their_own_multipliers_and_shared_ones_are_kept_whol
 @pytest.mark.parametrize("name", ["primal-dual", "alm"])
 @pytest.mark.parametrize("on", ["noisy", "clean"])
 def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(name, on):
-    """The wall's multiplier of waypoint 3 alone: a step later waypoint 2 alone is pushed, and along the wall's normal."""
+    """The wall's multiplier of waypoint 3 alone: a step later waypoint 2 alone is pushed, and along
+    the wall's normal.
+    """
     x = normal(0, 1, H, 2) * 0.1 + torch.tensor(
         [0.3, 3.0], dtype=F64
     )  # far from the ball, within the wall

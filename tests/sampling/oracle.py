@@ -1,12 +1,14 @@
-"""Trajectory laws whose score is exact, their true constrained laws, and what separates a method's samples from them.
+"""Trajectory laws with an exact score, their true constrained laws, and measures of the difference.
 
-The law is a mixture of Gaussian-process bridges in the plane: component k is N(m_k, s_k^2 C) in x and in y, with
-C = V diag(l) V^T the covariance of a smooth bridge, zero at the start and the goal. With a = alpha_bar_t
+The law is a mixture of Gaussian-process bridges in the plane: component k is N(m_k, s_k^2 C) in x
+and in y, with C = V diag(l) V^T the covariance of a smooth bridge, zero at the start and the goal.
+With a = alpha_bar_t and v_k = a s_k^2 l + 1 - a
 
-    E[x_0 | x_t] = sum_k w_k(x_t) (m_k + V diag(sqrt(a) s_k^2 l / v_k) V^T (x_t - sqrt(a) m_k)),   v_k = a s_k^2 l + 1 - a
+    E[x_0 | x_t] = sum_k w_k(x_t) (m_k + V diag(sqrt(a) s_k^2 l / v_k) V^T (x_t - sqrt(a) m_k))
     w_k  proportional to  p_k N(x_t; sqrt(a) m_k, V diag(v_k) V^T)
 
-The constrained law is this law given g <= 0 at every waypoint; rejection samples it without any diffusion.
+The constrained law is this law given g <= 0 at every waypoint; rejection samples it without any
+diffusion.
 """
 
 import math
@@ -43,7 +45,9 @@ from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 Array = NDArray[np.float64]
 F64 = torch.float64
 SCALE = 1.4  # metres a normalised unit, as in the U-maze
-SAFE = 1e-5  # g up to this counts as kept: float32 rounding of a plan that was not polished
+SAFE = (
+    1e-5  # [m] largest g that counts as safe: float32 rounding of a plan without final projection
+)
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,9 @@ class Routes:
 
     @cached_property
     def modes(self) -> tuple[Tensor, Tensor]:
-        """Eigenvalues [horizon] and eigenvectors [horizon, horizon] of the bridge's covariance, its largest variance 1."""
+        """Eigenvalues [horizon] and eigenvectors [horizon, horizon] of the bridge's covariance, its
+        largest variance 1.
+        """
         s = torch.linspace(0, 1, self.horizon, dtype=F64)
         r = math.sqrt(5) * (s[:, None] - s).abs() / self.length
         kernel = (1 + r + r * r / 3) * torch.exp(-r)  # Matern 5/2: two derivatives
@@ -84,14 +90,16 @@ class Routes:
         return self.means[k] + self.std[k, None, None] * (vectors * values.sqrt()) @ z
 
     def truth(self, g: Constraint, n: int, generator: torch.Generator) -> tuple[Array, float]:
-        """n exact samples of the law given g <= 0 at every waypoint, and the share of draws that were accepted."""
+        """n exact samples of the law given g <= 0 at every waypoint, and the share of draws that
+        were accepted.
+        """
         kept, drawn = [], 0
         while sum(map(len, kept)) < n:
             x = self.draw(4 * n, generator)
             drawn += len(x)
             kept.append(x[(g(x) <= 0).all(1)])
-        found = torch.cat(kept)
-        return found[:n].numpy(), len(found) / drawn
+        accepted = torch.cat(kept)
+        return accepted[:n].numpy(), len(accepted) / drawn
 
     def denoiser(self, schedule: Schedule) -> Denoiser:
         """(x_t, t) -> E[x_0 | x_t] in normalised coordinates z = x / SCALE, in the dtype of x_t."""
@@ -121,7 +129,9 @@ class Routes:
 
 
 def three_routes(horizon: int = 32) -> Routes:
-    """Over, under and straight through, from (-1.2, 0) to (1.2, 0): 45, 35 and 20 % of the trajectories."""
+    """Over, under and straight through, from (-1.2, 0) to (1.2, 0): 45, 35 and 20 % of the
+    trajectories.
+    """
     s = torch.linspace(0, 1, horizon, dtype=F64)
     x = -1.2 * torch.cos(math.pi * s)  # from rest to rest
     height = torch.tensor([0.9, -0.9, 0.0], dtype=F64)
@@ -132,7 +142,7 @@ def three_routes(horizon: int = 32) -> Routes:
     )
 
 
-# constraints, in metres ---------------------------------------------------------------------------------------------------
+# constraints, in metres ---------------------------------------------------------------------------
 
 
 def _half_space(x: float, y: float, b: float) -> HalfSpace:
@@ -166,7 +176,9 @@ CONSTRAINTS = {
 
 
 def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
-    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the waypoints, where the truth has it."""
+    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the
+    waypoints, where the truth has it.
+    """
     schedule = Schedule.cosine(n_steps)
     scale = Normaliser(torch.zeros(2, dtype=F64), torch.full((2,), SCALE, dtype=F64))
     start, goal = law.means[0, [0, -1]].numpy()
@@ -174,13 +186,15 @@ def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
     return Problem(planner, declared=g, enforced=g, start=start, goal=goal)
 
 
-# what separates samples from the truth ------------------------------------------------------------------------------------
+# what separates samples from the truth ------------------------------------------------------------
 
 
 def energy_distance(x: Array, y: Array) -> float:
-    """2 E|x - y| - E|x - x'| - E|y - y'|, |.| the root mean square distance of waypoints, in metres.
+    """2 E|x - y| - E|x - x'| - E|y - y'|, |.| the root mean square distance of waypoints, in
+    metres.
 
-    Unbiased (no pair of a sample with itself): zero on average where both have one law, and it can come out negative.
+    Unbiased (no pair of a sample with itself): zero on average where both have one law, and it can
+    come out negative.
     """
     if min(len(x), len(y)) < 2:
         return math.nan
@@ -195,8 +209,9 @@ def route_shares(law: Routes, x: Array) -> Array:
 
 
 def energy_within_routes(law: Routes, x: Array, truth: Array) -> float:
-    """Energy distance of the samples on one route to the true ones on it, mean over the truth's shares: what is left once the
-    mass on each route is right. Routes of fewer than 20 samples on either side are left out.
+    """Energy distance of the samples on one route to the true ones on it, mean over the truth's
+    shares: what is left once the mass on each route is right. Routes of fewer than 20 samples on
+    either side are left out.
     """
     mine, theirs = law.route(x), law.route(truth)
     pairs = [(x[mine == k], truth[theirs == k]) for k in range(len(law.means))]
@@ -213,7 +228,9 @@ def jump_limit(truth: Array) -> float:
 def measure(
     law: Routes, g: Constraint, x: Array, x_free: Array, truth: Array, limit: float
 ) -> dict[str, float]:
-    """Every measure of samples x [n, horizon, 2]; x_free are the unconstrained ones of the same noise."""
+    """Every measure of samples x [n, horizon, 2]; x_free are the unconstrained ones of the same
+    noise.
+    """
     return {
         "energy": energy_distance(x, truth),
         "within": energy_within_routes(law, x, truth),
@@ -225,28 +242,27 @@ def measure(
     }
 
 
-# variants of a method ---------------------------------------------------------------------------------------------------
+# variants of a method -----------------------------------------------------------------------------
 
 
-class Polished:
-    """What these variants say of themselves, as the methods of cdiff_cli.sampling do."""
+@dataclass(frozen=True)
+class Latent:
+    """A method on the clean estimate that shifts the sample x_t along with it.
+
+    The estimated noise therefore stays as it is. With a = alpha_bar_t and b = alpha_bar_{t-1}:
+
+        x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0)
+
+    With DDPM, reverse(x0') - reverse(x0) is only the share beta_t / (1 - a) of that shift: its
+    coefficient of x0 over sqrt(b). With DDIM the share is 1 - sqrt(a (1 - b) / (b (1 - a))). The
+    whole shift is made at each step, so more steps push harder, where the kernel correction
+    approaches a limit.
+    """
 
     enforces: ClassVar[bool] = True
     polished: ClassVar[bool] = True
     candidates: ClassVar[int] = 1
     planner: ClassVar[PlannerKind] = "unconditional"
-
-
-@dataclass(frozen=True)
-class Latent(Polished):
-    """A method on the clean estimate whose shift of it is carried to x_t as well, so that the noise estimate stays:
-
-        x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0),   a, b = alpha_bar_t, alpha_bar_{t-1}
-
-    DDPM's reverse(x0') - reverse(x0) is only beta_t / (1 - a) of that, its coefficient of x0 over sqrt(b). For DDIM the same
-    holds with 1 - sqrt(a (1 - b) / (b (1 - a))). The whole shift is made at each step, so more steps push harder, where
-    the plain one approaches a limit.
-    """
 
     inner: Method
     schedule: Schedule
@@ -265,8 +281,13 @@ class Latent(Polished):
 
 
 @dataclass(frozen=True)
-class Over(Polished):
-    """Projection of the clean estimate, overdone: x0' = x0 + fold (P(x0) - x0), the last one exact."""
+class Over:
+    """Over-projection of the clean estimate: x0' = x0 + fold (P(x0) - x0); fold 1 at the end."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     fold: float
 
@@ -279,8 +300,13 @@ class Over(Polished):
 
 
 @dataclass(frozen=True)
-class Asked(Polished):
-    """Latent projection that asks the network about the shifted x_t before it goes on: two calls a step."""
+class CalledTwice:
+    """Latent projection that evaluates the network again at the shifted x_t: two calls per step."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     schedule: Schedule
     denoiser: Denoiser
@@ -297,8 +323,15 @@ class Asked(Polished):
 
 
 @dataclass(frozen=True)
-class Late(Polished):
-    """A method that acts in the last `steps` of n_steps only; before them the sampler is left alone."""
+class Late:
+    """A method that acts in the last `steps` of n_steps only; before them the sampler is left
+    alone.
+    """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     inner: Method
     steps: int
@@ -315,17 +348,19 @@ class Late(Polished):
         return x, (inner, max(i - 1, 1))
 
 
-# runs ---------------------------------------------------------------------------------------------------------------------
+# runs ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Run:
     """One way to sample the constrained law.
 
-    sampler  kernel, extra steps and final projection; its `steps` are not used
-    k        candidates a plan, of which the first that obeys is kept, else the one that violates least
+    sampler  kernel, extra steps and polish; its own `steps` are not used
+    k        candidates per plan; the first safe one is kept, else the one that violates
+             least
     steps    steps of the respaced schedule, None for all
-    repair   a plan of which no candidate obeys: its noise sampled again by this method, None: the polish alone
+    repair   method that samples again where no candidate is safe, with the same noise; None: the
+             polish alone
     """
 
     name: str
@@ -337,7 +372,9 @@ class Run:
 
 
 def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
-    """Every method under every preset of a task's recipe; the unconstrained one, alike in all, once."""
+    """Every method under every preset of a task's recipe; the unconstrained one, alike in all,
+    once.
+    """
     runs = [Run("diffuser", Unconstrained(), SamplerSettings())]
     for label, preset in load_recipe(task).presets.items():
         for name in METHODS:
@@ -369,7 +406,7 @@ def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
             for name, method in clean.items()
         ),
         Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), sampler),
-        Run("latent projected, 2 calls", Asked(schedule, at.planner.denoiser), sampler),
+        Run("latent projected, 2 calls", CalledTwice(schedule, at.planner.denoiser), sampler),
         Run("latent projected, last half", Latent(half, schedule), sampler),
         Run("projected, last half", half, sampler),
         Run("projected, final only", Late(projected, 1, n_steps), sampler),
@@ -394,25 +431,35 @@ def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
 
 
 def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
-    """Samples [n, horizon, 2], one a seed, and network calls a plan, counted at the denoiser."""
-    asked = 0
+    """Samples [n, horizon, 2], one per seed, and the network calls per plan."""
+    calls = 0
 
     def counted(z: Traj, t: int) -> Traj:
-        nonlocal asked
-        asked += len(z)
+        nonlocal calls
+        calls += len(z)
         return at.planner.denoiser(z, t)
 
-    here = replace(at, planner=replace(at.planner, denoiser=counted).respaced(run.steps))
+    respaced = replace(
+        at,
+        denoiser=counted,
+        schedule=at.schedule if run.steps is None else at.schedule.respaced(run.steps),
+    )
+    preset = run.preset
 
     def plans(method: Method, draws: Sequence[int]) -> Array:
-        return plan(here, method, draws, run.sampler).x
+        kernel, extra = preset.kernel, preset.extra_steps
+        return plan(
+            respaced, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish
+        ).x
 
     if run.k == 1:
         x = plans(
-            replace(run.method, denoiser=counted) if isinstance(run.method, Asked) else run.method,
+            replace(run.method, denoiser=counted)
+            if isinstance(run.method, CalledTwice)
+            else run.method,
             seeds,
         )
-        return x, asked / len(seeds)
+        return x, calls / len(seeds)
     draws = (
         np.array(seeds) + 10_000_000 * np.arange(run.k)[:, None]
     )  # [k, n], the first those of every other run
@@ -427,4 +474,4 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
     elif bad.any():
         z = at.normaliser.encode(torch.from_numpy(x[bad]))
         x[bad] = at.normaliser.decode(polish_plans(at, z)[0]).numpy()
-    return x, asked / len(seeds)
+    return x, calls / len(seeds)
