@@ -1,8 +1,8 @@
-"""One code path for every device: code that runs per diffusion step or per plan names its device.
+"""Code that runs at every diffusion step or plan sets the device of every tensor.
 
-No GPU is needed: the default device is one whose tensors hold nothing, so a tensor made there
-cannot be used. What is made on the host on purpose and kept, such as the solvers' matrices, is
-made by a first call.
+The tests need no GPU: the default device is `meta`, whose tensors have no values, so that a tensor
+without a device cannot be used. Tensors that stay on the host on purpose, such as matrices of the
+solvers, are made by a first call.
 """
 
 from pathlib import Path
@@ -36,7 +36,7 @@ def resolved(file, method):
 
 
 def twice(work):
-    """The same work, the second time with nothing behind the default device."""
+    """The same work, the second time with `meta` as the default device."""
     with torch.inference_mode():
         first = work()
         with torch.device("meta"):
@@ -48,7 +48,7 @@ def twice(work):
     "method", ["diffuser", "projected", "primal-dual", "alm", "safediffuser", "terminal"]
 )
 @pytest.mark.parametrize("file", FILES)
-def test_sampling_names_the_device_of_every_tensor(file, method):
+def test_sampling_sets_the_device_of_every_tensor(file, method):
     asked = resolved(file, method)
     problem = asked.problem
     g = pull_back(
@@ -76,7 +76,7 @@ def test_sampling_names_the_device_of_every_tensor(file, method):
 
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("dynamics", [True, False])
-def test_the_last_projection_names_the_device_of_every_tensor(file, dynamics):
+def test_final_projection_sets_the_device_of_every_tensor(file, dynamics):
     problem = resolved(file, "alm").problem
     g = problem.enforced if dynamics else split(problem.enforced)[0]
     g = pull_back(g, problem.normaliser.centre, problem.normaliser.scale)
@@ -87,8 +87,8 @@ def test_the_last_projection_names_the_device_of_every_tensor(file, dynamics):
 
 @pytest.mark.parametrize("method", ["projected", "primal-dual", "alm"])
 @pytest.mark.parametrize("task", ["hopper", "swimmer", "ball-run"])
-def test_plans_of_control_name_the_device_of_every_tensor(task, method):
-    """Barrier chains over a short window, the obstacle of the ball run where it was observed."""
+def test_receding_horizon_plans_set_the_device_of_every_tensor(task, method):
+    """Discrete barriers over a short window, bound to the observed obstacle of the ball run."""
     made = load_task(task)
     observable = tuple(getattr(made, "observable", ()))
     _, g = load_constraints(

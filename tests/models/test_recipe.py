@@ -1,4 +1,4 @@
-"""Presets of a recipe: kernel and steps, how they are checked and what a command makes of them."""
+"""Presets of a recipe: kernel and steps, their checks, and their effect on a command."""
 
 from dataclasses import replace
 from typing import get_args
@@ -20,7 +20,7 @@ PRESETS = "presets:\n  fast:\n    sampler: {kernel: dpm++2m, steps: 6, polish: t
 
 
 def recipe(path, presets, n_steps=64):
-    """The U-maze's recipe with these presets in place of its own, read from a file."""
+    """The recipe of the U-maze with these presets, read from a file."""
     text = (home() / "models" / "maze2d-umaze" / "recipe.yaml").read_text()
     path /= "recipe.yaml"
     path.write_text(
@@ -40,7 +40,7 @@ def test_a_preset_may_name_every_kernel():
 
 
 @pytest.mark.usefixtures("fast")
-def test_a_preset_with_steps_plans_in_that_many_calls():
+def test_preset_with_steps_plans_in_that_many_calls():
     resolved = resolve(Request(preset="fast", n=1))
     sampler = resolved.preset.sampler
     assert (sampler.kernel, resolved.problem.planner.schedule) == (
@@ -54,7 +54,7 @@ def test_a_preset_with_steps_plans_in_that_many_calls():
 
 
 @pytest.mark.usefixtures("fast")
-def test_steps_of_the_command_win_over_those_of_the_preset():
+def test_steps_option_overrides_the_preset():
     resolved = resolve(Request(preset="fast", steps=9))
     assert resolved.problem.planner.schedule == Schedule.cosine(64).respaced(9)
     assert resolved.row()["preset"] == "fast*"
@@ -64,9 +64,7 @@ def test_a_preset_without_steps_takes_all_as_trained():
     assert resolve(Request()).problem.planner.schedule == Schedule.cosine(64)
 
 
-def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
-    tmp_path, monkeypatch
-):
+def test_preset_with_more_steps_than_trained_is_refused(tmp_path, monkeypatch):
     longer = recipe(
         tmp_path, PRESETS.replace("6", "100"), n_steps=128
     )  # the shipped checkpoint has 64
@@ -100,7 +98,7 @@ def test_a_preset_with_more_steps_than_a_checkpoint_was_trained_for_is_refused(
         (("6", "65"), "presets.fast.sampler.steps: expected 1 to 64 (n_steps), found 65"),
     ],
 )
-def test_a_bad_kernel_or_number_of_steps_in_a_preset_is_one_clear_line(wrong, complaint, tmp_path):
+def test_bad_kernel_or_steps_in_a_preset_is_refused_in_one_line(wrong, complaint, tmp_path):
     with pytest.raises(CdiffError) as error:
         recipe(tmp_path, PRESETS.replace(*wrong))
     assert complaint in str(error.value)
