@@ -6,12 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 
-def milliseconds(work: Callable[[], Any], repeats: int) -> float:
-    """Median wall time of some repeats, after a warm-up."""
-    work()
+def milliseconds(work: Callable[[], Any], repeats: int, warm_up: int = 1) -> float:
+    """Median wall time of one call, over repeats after a warm-up."""
+    for _ in range(warm_up):
+        work()
     times = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        start = time.perf_counter()
         work()
-        times.append(time.perf_counter() - began)
+        times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times)
