@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,8 +11,7 @@ import torch
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.commands.margins import Chosen, Conditions, choose, read_calibrations
-from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of
-from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of, weighted
 from cdiff_cli.constraints.spec.kinds import DYNAMICS_TOLERANCE
 from cdiff_cli.constraints.spec.load import Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
@@ -254,7 +253,7 @@ def resolve(options: Request) -> Experiment:
     kinds, g = load_constraints(
         path, task.name, task.layout, fitted, observable, getattr(task, "dt", None)
     )
-    limited = [part.name for part in g.parts if isinstance(part, RateLimit)]
+    limited = [kind.name for kind in kinds if kind.kind == "rate"]
     if limited and recipe.frame == "relative":
         raise CdiffError(
             f'"{limited[0]}": `kind: rate` is for whole plans, and {task.name} plans anew at every step; leave it out'
@@ -425,10 +424,7 @@ def _obeyed(
     weight = torch.tensor(
         [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
     )
-    parts = tuple(
-        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
-        for part in parts
-    )
+    parts = weighted(Constraint(parts), weight).parts
     unchanged = len(parts) == len(g.parts) and all(
         part is declared for part, declared in zip(parts, g.parts, strict=True)
     )

@@ -14,8 +14,6 @@ import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import RateLimit
-from cdiff_cli.constraints.state_sets import StateSet
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.tasks.protocol import Task
 
@@ -167,21 +165,17 @@ def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry
     A part over a level has the exact maximum (StateSet.segment_argmax), one that asks nothing between waypoints its own values, a rate is the
     same all along a segment, whose beginning is named; of any other it is only what was found, and no promise.
     """
-    level: StateSet | None = getattr(part, "level", None)
-    steady = isinstance(part, RateLimit)
-    exact = level is not None or steady or not part.spans
+    exact = part.exact_on_segments
     rows = _values(part.segment_max(_tensor(x)))
     at = [_first_worst(values) for values in rows]
-    if (level is None and not steady) or any(segment is None for segment in at):
-        places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
-    else:
+    shares = None
+    places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
+    if exact and all(segment is not None for segment in at):
         plan, segment = np.arange(len(x)), np.array(at)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = (
-            np.zeros(len(x))
-            if level is None
-            else level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
-        )
+        shares = part.segment_argmax(_tensor(np.stack((begin, end), 1)))
+    if shares is not None:
+        share = shares[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}
@@ -230,7 +224,7 @@ def _waypoint(
     step = re.search(r"@\d+-(\d+)$", label)
     if step is not None:
         return int(step[1])
-    single = re.search(r"@(\d+)$", label) if hasattr(part, "level") else None
+    single = re.search(r"@(\d+)$", label) if part.support == 1 else None
     return int(single[1]) if single is not None else row if rows == horizon else None
 
 

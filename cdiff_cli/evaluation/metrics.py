@@ -90,7 +90,7 @@ def effort(dynamics: LinearDynamics, x: Array) -> tuple[Array, NDArray[np.bool_]
     """
     states = torch.from_numpy(x)
     middle, half = (dynamics.high + dynamics.low) / 2, (dynamics.high - dynamics.low) / 2
-    asked = ((dynamics.wanted(states) - middle) / half).abs().flatten(1)
+    asked = ((dynamics.unbounded_inputs(states) - middle) / half).abs().flatten(1)
     return _largest(asked).numpy(), (dynamics.residual(states) <= 1e-5).all(1).numpy()
 
 

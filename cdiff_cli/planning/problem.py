@@ -8,8 +8,8 @@ import torch
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import RateLimit, refuse_contradiction
-from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.constraints.rate import check_rates
+from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.normaliser import Normaliser
@@ -48,15 +48,12 @@ def check_feasible(problem: Problem) -> None:
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
             _check_pin(problem, name, state, columns)
-    refuse_contradiction([part for part in problem.g.parts if isinstance(part, RateLimit)])
-    for part in problem.g.parts:
-        if isinstance(part, RateLimit) and problem.start is not None and problem.goal is not None:
-            pins = make_pins(
-                problem, len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu")
-            )
-            part.pull_back(problem.normaliser.centre, problem.normaliser.scale).refuse_pins(
-                pins, MARGIN
-            )
+    check_rates(problem.g)
+    if problem.start is not None and problem.goal is not None:
+        n = len(np.atleast_2d(problem.start))
+        pins = make_pins(problem, n, torch.float64, torch.device("cpu"))
+        for part in pull_back(problem.g, problem.normaliser.centre, problem.normaliser.scale).parts:
+            part.check_pins(pins, MARGIN)
 
 
 def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) -> None:
@@ -69,7 +66,7 @@ def _check_pin(problem: Problem, name: str, state: Array, columns: list[int]) ->
             f"the {name} ({point}) is inside a wall or touches one; choose a free point of {problem.task.name}"
         )
     for part in problem.g.parts:
-        level = getattr(part, "level", None)
+        level = part.level
         value = float(level(torch.from_numpy(state))) if level is not None else 0.0
         if value > 0:
             raise InfeasibleError(

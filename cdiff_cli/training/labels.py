@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.observed import Observed, ObservedValues
+from cdiff_cli.constraints.observed import ObservedValues
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
 
@@ -37,9 +37,11 @@ class ConstraintLabel:
         kinds, g = load_constraints(
             path, task.name, task.layout, None, observable, getattr(task, "dt", None)
         )
-        waits = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
         return cls(
-            path.stem, g, kinds_sha256(kinds), tuple(name for name in observable if name in waits)
+            path.stem,
+            g,
+            kinds_sha256(kinds),
+            tuple(name for name in observable if name in g.observes),
         )
 
     @property

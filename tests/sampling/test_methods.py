@@ -221,7 +221,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
     """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
     s = torch.linspace(-2, 2, horizon, dtype=F64)
     line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
-    g = Constraint((OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    g = Constraint((OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),))
     noise = draws(11, 1, horizon, 2)
     return sample(
         gaussian_denoiser(SCHEDULE, line, 1e-3),
@@ -255,7 +255,7 @@ def test_multipliers_of_segments_keep_their_places_and_pins_stay(kind, on, expec
     g = Constraint(
         (
             AtWaypoints("wall", half_space()),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),
         )
     )
     method, pins = kind(on=on, expectation=expectation), pin(x, 0, -1)
@@ -303,7 +303,7 @@ def test_every_method_meets_the_same_noise():
 
 def test_silu_replaces_g_by_its_smooth_positive_part_and_its_slope():
     x = normal(4, 3, 2, 2)
-    g = waypoints(ball(1))
+    g = waypoints(ball("outside"))
     lam = normal(5, 3, 2).abs()
     leaf = x.clone().requires_grad_()
     smooth = torch.nn.functional.silu(g(leaf))

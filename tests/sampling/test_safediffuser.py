@@ -66,7 +66,7 @@ def test_with_gain_one_a_half_space_is_met_by_its_margin():
 
 def test_a_ball_is_linearised_at_x_t_and_its_outside_kept():
     """The tangent half-space lies within the outside of a ball: with gain one x_{t-1} is safe by the margin or more."""
-    g, x, asked = waypoints(ball(1)), normal(2, 20, 3, 2), normal(3, 20, 3, 2, scale=0.5)
+    g, x, asked = waypoints(ball("outside")), normal(2, 20, 3, 2), normal(3, 20, 3, 2, scale=0.5)
     assert float(g(asked).max()) > 0.1
     assert float(g(moved(SafeDiffuser(), g, x, asked)).max()) <= -0.01 + 1e-9
 

@@ -139,8 +139,8 @@ def draw_unsafe(axis: Any, task: Any, g: Constraint, extent: Sequence[float] | N
     grid = np.zeros((*xs.shape, len(task.layout)))
     grid[..., at[0]], grid[..., at[1]] = xs, ys
     for part in g.parts:
-        if in_plane(part, task):
-            value = part.level(torch.from_numpy(grid)).numpy()  # type: ignore[attr-defined]
+        if (level := part.level) is not None and in_plane(part, task):
+            value = level(torch.from_numpy(grid)).numpy()
             if value.max() > 0:
                 axis.contourf(
                     xs,
