@@ -41,7 +41,7 @@ def disc(dim: int, radius: float = 1.0) -> Ellipsoid:
         torch.zeros(2, dtype=torch.float64),
         torch.full((2,), radius, dtype=torch.float64),
         torch.tensor(radius),
-        1,
+        "outside",
     )
 
 

@@ -71,12 +71,12 @@ def saddle():
 
 LEVELS = {
     "half-space": half_space(),
-    "inside ball": ball(-1),
-    "outside ball": ball(1),
-    "inside ball squared": ball(-1).quadric(),
-    "outside ball squared": ball(1).quadric(),
-    "inside ellipsoid": ellipsoid(-1),
-    "outside ellipsoid": ellipsoid(1),
+    "inside ball": ball("inside"),
+    "outside ball": ball("outside"),
+    "inside ball squared": ball("inside").quadric(),
+    "outside ball squared": ball("outside").quadric(),
+    "inside ellipsoid": ellipsoid("inside"),
+    "outside ellipsoid": ellipsoid("outside"),
     "general quadric": saddle(),
 }
 
@@ -100,8 +100,8 @@ KINDS = {
     "stack": Constraint(
         (
             AtWaypoints("a", half_space()),
-            DiscreteBarrier("b", ball(1), 0.4),
-            AtWaypoints("e", ellipsoid(-1)),
+            DiscreteBarrier("b", ball("outside"), 0.4),
+            AtWaypoints("e", ellipsoid("inside")),
         )
     ),
 }

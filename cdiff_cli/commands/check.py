@@ -8,16 +8,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
-from cdiff_cli.constraints.observed import Observed
-from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.load import load_constraints
-from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.evaluation.figures import plans as plan_figures
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
-from cdiff_cli.projection.project import has_exact_form
+from cdiff_cli.projection.projectors import projection_method
 from cdiff_cli.tasks import load_task
 from cdiff_cli.yaml_files import Document
 
@@ -56,10 +52,8 @@ def check(file: Path, picture: Path, out: Console) -> None:
         "demonstrations that obey",
     ):
         table.add_column(heading, overflow="fold")
-    for spec, part in zip(kinds, g.parts, strict=True):
-        form = (
-            part.example(recipe.horizon)[0] if isinstance(part, Observed) else part
-        )  # its form, where its numbers are observed
+    forms = g.example(recipe.horizon).parts
+    for spec, part, form in zip(kinds, g.parts, forms, strict=True):
         used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
         obey = (
             ""
@@ -72,11 +66,11 @@ def check(file: Path, picture: Path, out: Console) -> None:
             escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
-            _projection(form),
+            projection_method(form),
             obey,
         )
     out.print(table)
-    fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
+    fixed = g.known()
     if len(task.positions) != 2:
         out.print(
             f"picture  none: the states of {name} have no place in the plane; "
@@ -95,12 +89,3 @@ def check(file: Path, picture: Path, out: Console) -> None:
         picture, task, fixed, np.empty((0, 2, len(task.layout))), sample, file.stem
     )
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
-
-
-def _projection(form: TrajectoryConstraint) -> str:
-    """How the nearest trajectory that obeys it is found (project.py)."""
-    if isinstance(form, LinearDynamicsConstraint):
-        return "active set"
-    if isinstance(form, RateLimit):
-        return "ADMM"
-    return "exact" if has_exact_form(form) else "sequential (ProxQP)"

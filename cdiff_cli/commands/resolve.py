@@ -10,8 +10,7 @@ import torch
 from cdiff_cli.arrays import Array
 from cdiff_cli.commands.experiment import Experiment, Request
 from cdiff_cli.commands.margins import ChosenMargins, choose_margins, read_calibrations
-from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of
-from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of, weighted
 from cdiff_cli.constraints.spec.kinds import DYNAMICS_TOLERANCE
 from cdiff_cli.constraints.spec.load import Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
@@ -275,7 +274,7 @@ def compile_constraints(
     kinds, declared = load_constraints(
         path, task.name, task.layout, loaded.planner.dynamics, observable_of(task), task.dt
     )
-    limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
+    limited = [kind.name for kind in kinds if kind.kind == "rate"]
     if limited and task.control == "receding_horizon":
         raise CdiffError(
             f'"{limited[0]}": `kind: rate` is for whole plans, '
@@ -298,10 +297,7 @@ def enforced_form(
     weight = torch.tensor(
         [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
     )
-    parts = tuple(
-        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
-        for part in parts
-    )
+    parts = weighted(Constraint(parts), weight).parts
     same = len(parts) == len(declared.parts) and all(
         part is one for part, one in zip(parts, declared.parts, strict=True)
     )

@@ -15,8 +15,6 @@ import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import RateLimit
-from cdiff_cli.constraints.state_sets import StateSet
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.tasks.protocol import Task
 
@@ -179,19 +177,17 @@ def _on_segments(part: TrajectoryConstraint, x: Array, task: Task | Axes) -> lis
     says nothing about segments, and for a rate limit: a rate is constant on a segment, and its
     place is the start. For every other constraint it is a lower bound of the maximum.
     """
-    level: StateSet | None = getattr(part, "level", None)
-    constant = isinstance(part, RateLimit)
-    exact = level is not None or constant or not part.spans
+    exact = part.exact_on_segments
     rows = _values(part.segment_max(_tensor(x)))
     segments = [_first_worst(values) for values in rows]
-    if (level is None and not constant) or any(segment is None for segment in segments):
-        places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
-    else:
+    shares = None
+    places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
+    if exact and all(segment is not None for segment in segments):
         plan, segment = np.arange(len(x)), np.array(segments)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = np.zeros(len(x))
-        if level is not None:
-            share = level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
+        shares = part.segment_argmax(_tensor(np.stack((begin, end), 1)))
+    if shares is not None:
+        share = shares[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}
@@ -246,7 +242,7 @@ def _waypoint(
     step = re.search(r"@\d+-(\d+)$", label)
     if step is not None:
         return int(step[1])
-    single = re.search(r"@(\d+)$", label) if hasattr(part, "level") else None
+    single = re.search(r"@(\d+)$", label) if part.support == 1 else None
     return int(single[1]) if single is not None else row if rows == horizon else None
 
 

@@ -1,13 +1,12 @@
 """Starts and goals of whole plans: as the user gives them, or drawn at random."""
 
-import math
 from typing import Any
 
 import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.rate import max_rate
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.recipe import Card
@@ -49,13 +48,7 @@ def parse_state(
 
 def fastest(task: Any, g: Constraint) -> float:
     """The largest speed that limits on the rate of the positions allow, m/s; inf without any."""
-    at = {task.layout.index(name) for name in task.positions}
-    own = [
-        part.high
-        for part in g.parts
-        if isinstance(part, RateLimit) and part.norm and set(part.which.argmax(1).tolist()) == at
-    ]
-    return min(own, default=math.inf)
+    return max_rate(g, {task.layout.index(name) for name in task.positions})
 
 
 def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tuple[Array, Array]:
@@ -71,7 +64,7 @@ def random_pairs(task: Any, g: Constraint, card: Card, n: int, seed: int) -> tup
         pair = np.stack([np.concatenate((task.random_point(rng), still)) for _ in range(2)])
         speed = task.path_length(*pair[:, :2]) / ((card.horizon - 1) * task.dt)
         x = torch.from_numpy(pair)
-        levels = [level for part in g.parts if (level := getattr(part, "level", None)) is not None]
+        levels = [part.level for part in g.parts if part.level is not None]
         if speed > fastest(task, g):
             continue
         if speed <= card.data["speed_q95"] and all(bool((level(x) <= 0).all()) for level in levels):

@@ -24,11 +24,7 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.barrier import DiscreteBarrier
-from cdiff_cli.constraints.rate import RateLimit
-from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
-from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
 from cdiff_cli.sampling.sampler import PlannerKind, Step
@@ -110,7 +106,7 @@ def rows_of(g: Constraint, step: Step, offset: float, gain: float) -> BarrierRow
     Rows without a free coordinate get the bound inf.
     """
     x, free = step.x, ~step.pins.mask
-    if all(isinstance(part, AtWaypoints) for part in g.parts):
+    if all(part.support == 1 for part in g.parts):
         linearised = [part.linearise(x) for part in g.parts]
         gradients = [pull(torch.ones_like(values)) for values, pull, _ in linearised]
         A = torch.stack(gradients, 2) * free[:, None]
@@ -130,15 +126,9 @@ def jacobian(part: TrajectoryConstraint, x: Traj) -> Tensor:
     """
     values, pull, _ = part.linearise(x)
     n, horizon = values.shape[1], x.shape[1]
-    reaches = {
-        AtWaypoints: 1,
-        OnSegments: 2,
-        RateLimit: 2,
-        DiscreteBarrier: len(part.coefficients) if isinstance(part, DiscreteBarrier) else 0,
-    }
-    reach = reaches.get(type(part))
+    reach = part.support
     out = x.new_zeros(len(x), n, horizon, x.shape[2])
-    if reach is None:
+    if not reach:
         for row in range(n):
             out[:, row] = pull(one_hot(row, values))
         return out

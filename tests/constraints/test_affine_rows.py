@@ -40,11 +40,11 @@ def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, al
 
 def test_what_is_not_affine_is_left_part_by_part():
     assert Constraint(()).condense(H, 2) is None
-    assert waypoints(ball(1)).condense(H, 2) is None
+    assert waypoints(ball("outside")).condense(H, 2) is None
     both = Constraint(
         (
             *chain(HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5).parts,
-            *waypoints(ball(1)).parts,
+            *waypoints(ball("outside")).parts,
         )
     )
     assert both.condense(H, 2) is None

@@ -11,16 +11,9 @@ from hypothesis import strategies as st
 from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import converted, segment_max, selected
 from cdiff_cli.constraints.segments import OnSegments
-from cdiff_cli.constraints.state_sets import (
-    Ellipsoid,
-    HalfSpace,
-    Quadric,
-    QuadricInFrame,
-    converted,
-    segment_max,
-    selected,
-)
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import project
@@ -181,7 +174,7 @@ def test_between_waypoints_a_moving_level_moves_evenly(name, seed):
 
 def test_a_path_that_crosses_the_way_of_a_ball_is_safe_if_the_ball_is_gone():
     x = vec(-2.0, 0.0, 2.0, 0.0).reshape(1, 2, 2)
-    standing = ball(1, centre=(0.0, 0.0), radius=1.0)
+    standing = ball("outside", centre=(0.0, 0.0), radius=1.0)
     assert float(segment_max(standing, x)) == pytest.approx(1.0)
     offset = vec(0.0, -3.0, 0.0, 3.0).reshape(
         1, 2, 2
@@ -247,7 +240,7 @@ def test_chains_that_differ_by_plan_are_those_of_each_plan_alone(kind, start, se
 @quick
 @given(seed=seeds)
 def test_segments_outside_balls_that_differ_by_plan_are_those_of_each_plan_alone(seed):
-    level, z = moving(ball(1), seed, 3, 1), normal(seed, 3, 7, 2)
+    level, z = moving(ball("outside"), seed, 3, 1), normal(seed, 3, 7, 2)
     x = free_projection(Constraint((OnSegments("s", level),)), z)
     for i in range(3):
         alone = free_projection(Constraint((OnSegments("s", at(level, i, 0)),)), z[i : i + 1])
@@ -260,11 +253,16 @@ def test_segments_of_a_moving_ball_are_those_of_a_resting_one_in_its_own_frame(s
     """And in windows of another scale at each waypoint, distances are then those of the window."""
     z, offset = normal(seed, 3, 7, 2), 0.3 * normal(seed + 5, 3, 7, 2)
     x = free_projection(
-        Constraint((OnSegments("s", ball(1).pull_back(-offset, torch.ones(2, dtype=F64))),)), z
+        Constraint(
+            (OnSegments("s", ball("outside").pull_back(-offset, torch.ones(2, dtype=F64))),)
+        ),
+        z,
     )
-    resting = free_projection(Constraint((OnSegments("s", ball(1)),)), z - offset)
+    resting = free_projection(Constraint((OnSegments("s", ball("outside")),)), z - offset)
     torch.testing.assert_close(x - offset, resting, atol=1e-9, rtol=0)
-    back = pull_back(Constraint((OnSegments("s", ball(1)),)), *frame(seed, (3, 7), shared=True))
+    back = pull_back(
+        Constraint((OnSegments("s", ball("outside")),)), *frame(seed, (3, 7), shared=True)
+    )
     assert float(back(free_projection(back, z)).max()) <= 1e-7  # what project promises
 
 
@@ -298,7 +296,7 @@ def test_a_chain_outside_a_ball_with_a_scale_a_waypoint_agrees_with_proxqp_along
     """h_k = s_k (|z_k - c_k| - r_k): the nearest trajectory moves radially, and |z_k - c_k| solves a QP with bounds at 0."""
     z = normal(seed, 2, n, 2)
     centre, scale = normal(seed + 1, 2, n, 2), (normal(seed + 2, n, 1).abs() + 0.2).expand(-1, 2)
-    g = pull_back(chain(ball(1), alpha), centre, scale)
+    g = pull_back(chain(ball("outside"), alpha), centre, scale)
     x = project(g, z, pin(z, 0) if pinned else Pins.none(z))
     level, s, gamma = g.parts[0].level, scale[:, 0].numpy(), 1 - alpha
     away, ended = (((v - level.centre).norm(dim=-1)).numpy() for v in (z, x))
@@ -321,7 +319,11 @@ def test_radii_that_differ_by_waypoint_are_kept_by_hand():
     """alpha = 1 is clipping: each waypoint to its own radius."""
     radius = vec(1.0, 2.0, 3.0)
     level = Ellipsoid(
-        torch.eye(2, dtype=F64), torch.zeros(2, dtype=F64), radius[:, None].expand(3, 2), radius, 1
+        torch.eye(2, dtype=F64),
+        torch.zeros(2, dtype=F64),
+        radius[:, None].expand(3, 2),
+        radius,
+        "outside",
     )
     z = vec(0.5, 0.0, 0.5, 0.0, 5.0, 0.0).reshape(1, 3, 2)
     x = project(chain(level, 1.0), z, pin(z, 0))
@@ -333,7 +335,11 @@ def test_radii_that_differ_by_waypoint_are_kept_by_hand():
 def test_a_ball_that_shrinks_along_the_horizon_is_never_left_through_its_centre():
     radius = vec(3.0, 0.1, 0.1)
     level = Ellipsoid(
-        torch.eye(2, dtype=F64), torch.zeros(2, dtype=F64), radius[:, None].expand(3, 2), radius, 1
+        torch.eye(2, dtype=F64),
+        torch.zeros(2, dtype=F64),
+        radius[:, None].expand(3, 2),
+        radius,
+        "outside",
     )
     z = torch.full((1, 3, 2), 0.01, dtype=F64)
     x = project(chain(level, 0.1), z, Pins.none(z))
@@ -358,7 +364,7 @@ def test_from_an_unsafe_start_a_chain_over_a_half_space_asks_for_recovery(dtype)
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds, alpha=st.floats(0.01, 1.0))
 def test_from_inside_a_ball_the_chain_leads_out(start, seed, alpha):
-    g = chain(ball(1, centre=(0.0, 0.0), radius=1.0), alpha)
+    g = chain(ball("outside", centre=(0.0, 0.0), radius=1.0), alpha)
     z = normal(seed, 2, 9, 2, scale=0.3)
     z[:, 0] = vec(*start)
     x = project(g, z, pin(z, 0))
@@ -370,7 +376,7 @@ def test_from_inside_a_ball_the_chain_leads_out(start, seed, alpha):
 
 def test_a_path_that_rests_at_the_centre_leaves_along_the_first_axis():
     z = torch.zeros(1, 3, 2, dtype=F64)
-    x = project(chain(ball(1, centre=(0.0, 0.0), radius=2.0), 0.5), z, pin(z, 0))
+    x = project(chain(ball("outside", centre=(0.0, 0.0), radius=2.0), 0.5), z, pin(z, 0))
     torch.testing.assert_close(
         x, vec(0.0, 0.0, 1.0, 0.0, 1.5, 0.0).reshape(1, 3, 2), atol=1e-12, rtol=0
     )

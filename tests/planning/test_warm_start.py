@@ -20,7 +20,7 @@ from tests.problems import F64, ball, half_space, normal
 
 H = 5
 G = Constraint(
-    (OnSegments("ball", ball(1)), AtWaypoints("wall", half_space()))
+    (OnSegments("ball", ball("outside")), AtWaypoints("wall", half_space()))
 )  # 4 segments, 5 waypoints
 NOISY = {"expected": [101, 102, 103, 0, *(105, 106, 107, 108, 0)], "n": 9}  # in the order of g
 PLANES = {

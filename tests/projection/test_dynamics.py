@@ -74,14 +74,14 @@ def noisy_path(dynamics, seed, batch, horizon, noise=0.02):
     return path, z
 
 
-def solve(dynamics, z, pins, parts=(), rounds=3000, used=(0, 1), **more):
+def solve(dynamics, z, pins, parts=(), rounds=3000, columns=(0, 1), **more):
     settings = {
-        "used": used if parts or more.get("rest") else (),
+        "columns": columns if parts or more.get("others") else (),
         "weight": WEIGHT,
         "rounds": rounds,
         "tolerance": 1e-9,
     }
-    return project_dynamics(dynamics, parts, more.pop("rest", None), z, pins, **(settings | more))
+    return project_dynamics(dynamics, parts, more.pop("others", None), z, pins, **(settings | more))
 
 
 def distance(x, z):
@@ -145,7 +145,7 @@ def test_rollout_of_a_double_integrator_by_hand():
 def test_inputs_of_a_path_are_those_that_made_it_and_are_cut_to_their_bounds():
     d, u = double_integrator(), torch.tensor([[[0.5], [-3.0], [1.0]]], dtype=F64)
     x = d.rollout(vec(0.0, 1.0)[None], u)
-    torch.testing.assert_close(d.wanted(x), u, atol=1e-12, rtol=0)
+    torch.testing.assert_close(d.unbounded_inputs(x), u, atol=1e-12, rtol=0)
     torch.testing.assert_close(
         d.inputs(x), torch.tensor([[[0.5], [-1.0], [1.0]]], dtype=F64), atol=1e-12, rtol=0
     )
@@ -301,7 +301,11 @@ def test_every_iterate_obeys_the_dynamics(rounds):
     d = maze()
     _, z = noisy_path(d, 0, 3, 16)
     x, warm = solve(
-        d, z, pin(z, 0), [OnSegments("s", ball(1, centre=(0.1, 0.0), radius=0.2))], rounds=rounds
+        d,
+        z,
+        pin(z, 0),
+        [OnSegments("s", ball("outside", centre=(0.1, 0.0), radius=0.2))],
+        rounds=rounds,
     )
     torch.testing.assert_close(
         x, d.rollout(z[:, 0], warm.u), atol=1e-12, rtol=0
@@ -336,7 +340,7 @@ def test_going_on_from_where_it_stopped_reaches_the_same_point():
 @pytest.mark.parametrize("batch", [0, 2])
 @pytest.mark.parametrize("horizon", [1, 2])
 def test_short_horizons_and_empty_batches_pass(batch, horizon):
-    g = Constraint((reachable(maze()), OnSegments("s", ball(1, dim=4))))
+    g = Constraint((reachable(maze()), OnSegments("s", ball("outside", dim=4))))
     z = normal(0, batch, horizon, 4) + 3.0
     assert project(g, z, pin(z, 0)).shape == z.shape
 
@@ -357,7 +361,7 @@ def trip(horizon=64, length=0.8):
 @pytest.mark.parametrize("dtype", [F64, torch.float32])
 def test_a_disc_on_the_way_is_avoided_on_segments_within_the_inputs(dtype):
     z = trip()
-    disc = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))
+    disc = OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4))
     assert float(disc(z).max()) > 0.05
     g = Constraint((reachable(maze(), weight=WEIGHT), disc)).to(z.to(dtype))
     z = z.to(dtype)
@@ -377,7 +381,7 @@ def test_a_pulled_back_projection_is_the_pulled_back_result():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     x = project(g, z, pin(z, 0, 63))
@@ -393,7 +397,7 @@ def test_a_trajectory_that_obeys_all_stays():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 1.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 1.0), radius=0.12, dim=4)),
         )
     )
     torch.testing.assert_close(project(g, z, pin(z, 0, 63)), z, atol=1e-6, rtol=0)
@@ -416,7 +420,7 @@ def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
     "other",
     [
         DiscreteBarrier("c", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.0)), 0.3),
-        AtWaypoints("q", ball(-1, centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
+        AtWaypoints("q", ball("inside", centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
         AtWaypoints(
             "s",
             replace(
@@ -441,7 +445,7 @@ def test_a_chain_a_disc_and_a_wall_hold_at_once():
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
             AtWaypoints("wall", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.2))),
             DiscreteBarrier("slow", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.3)), 0.3),
         )
@@ -469,7 +473,7 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
         (
             reachable(maze(), weight=WEIGHT),
             slow,
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     assert float(slow(z).max()) > 0.3
@@ -484,7 +488,7 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
 
 def test_two_sets_of_dynamics_are_refused():
     g = Constraint((reachable(maze()), replace(reachable(maze()), name="more")))
-    with pytest.raises(InfeasibleError, match='"dyn" and "more": a plan can obey only one'):
+    with pytest.raises(InfeasibleError, match='"dyn" and "more": a plan can satisfy only one'):
         project(g, torch.zeros(1, 3, 4, dtype=F64), Pins.none(torch.zeros(1, 3, 4, dtype=F64)))
 
 

@@ -9,8 +9,8 @@ from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.dynamics import project_dynamics
-from cdiff_cli.projection.segments import planes
-from cdiff_cli.projection.solvers.active_set import AGAIN, Bounds, _at_active
+from cdiff_cli.projection.segments import tangent_half_spaces
+from cdiff_cli.projection.solvers.active_set import MAX_CHANGES_AGAIN, Bounds, _at_active
 from cdiff_cli.projection.solvers.active_set import solve as settle
 from cdiff_cli.projection.solvers.lq_tracking import tracking
 from tests.problems import F64, ball, normal, num, pin, vec
@@ -59,7 +59,7 @@ def test_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
     z[:, 0, :2] = -0.2
     expected, _ = solve(d, z, pin(z, 0), [wall(0.0)])
     assert float((expected @ WALL).max()) <= 1e-8
-    monkeypatch.setattr("cdiff_cli.projection.solvers.active_set.PATIENCE", -1)
+    monkeypatch.setattr("cdiff_cli.projection.solvers.active_set.STALLED_AFTER", -1)
     x, _ = solve(d, z, pin(z, 0), [wall(0.0)])
     torch.testing.assert_close(x, expected, atol=1e-6, rtol=0)
 
@@ -89,24 +89,26 @@ def test_plans_that_are_safe_get_no_tangent_planes(monkeypatch):
     z[1, :, 1] += 1.0
     asked = []
     monkeypatch.setattr(
-        "cdiff_cli.projection.dynamics.planes",
-        lambda parts, x, pins: asked.append(len(x)) or planes(parts, x, pins),
+        "cdiff_cli.projection.segments.tangent_half_spaces",
+        lambda parts, x, pins: asked.append(len(x)) or tangent_half_spaces(parts, x, pins),
     )
-    x, _ = solve(d, z, pin(z, 0, 63), [OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))])
+    x, _ = solve(
+        d, z, pin(z, 0, 63), [OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12))]
+    )
     assert set(asked) == {1}
     torch.testing.assert_close(x[1], z[1], atol=1e-8, rtol=0)
 
 
 def test_later_choices_of_planes_come_nearer():
     d, z = maze(), trip()
-    part = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12))
+    part = OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12))
     far = [
-        float(distance(solve(d, z, pin(z, 0, 63), [part], turns=turns)[0], z))
-        for turns in (1, 2, 3)
+        float(distance(solve(d, z, pin(z, 0, 63), [part], max_choices=choices)[0], z))
+        for choices in (1, 2, 3)
     ]
     assert far[2] <= far[1] + 1e-9 <= far[0] + 2e-9
-    for turns in (1, 3):
-        x, _ = solve(d, z, pin(z, 0, 63), [part], turns=turns)
+    for choices in (1, 3):
+        x, _ = solve(d, z, pin(z, 0, 63), [part], max_choices=choices)
         assert float(part(x[..., :2]).max()) <= 1e-8
 
 
@@ -127,24 +129,26 @@ def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_s
     """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
     d = maze(bound=0.3)
     z = trip()
-    near, far = (OnSegments("disc", ball(1, centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0))
+    near, far = (
+        OnSegments("disc", ball("outside", centre=(0.0, y), radius=0.3)) for y in (0.0, 1.0)
+    )
     _, warm = solve(d, z, pin(z, 0, 63), [near])
-    assert warm.soft.tolist() == [True]
+    assert warm.infeasible.tolist() == [True]
     solved = []
     monkeypatch.setattr(
         "cdiff_cli.projection.solvers.active_set._at_active",
         lambda *of: solved.append(int(of[1].active.flatten(1).any(1).sum())) or _at_active(*of),
     )
-    x, warm = solve(d, z + 1e-3, pin(z + 1e-3, 0, 63), [near], warm=warm, turns=3)
-    assert len(solved) <= 1 + AGAIN
-    assert warm.soft.tolist() == [True]
+    x, warm = solve(d, z + 1e-3, pin(z + 1e-3, 0, 63), [near], warm=warm, max_choices=3)
+    assert len(solved) <= 1 + MAX_CHANGES_AGAIN
+    assert warm.infeasible.tolist() == [True]
     assert bool(torch.isfinite(x).all())
     expected, _ = solve(maze(), z, pin(z, 0, 63), [far])
     for _ in range(
         4
     ):  # rows that pull where nothing is in the way any more leave all at once, then the inputs settle
         x, warm = solve(maze(), z, pin(z, 0, 63), [far], warm=warm)
-    assert warm.soft.tolist() == [False]
+    assert warm.infeasible.tolist() == [False]
     torch.testing.assert_close(x, expected, atol=1e-8, rtol=0)
 
 
@@ -157,7 +161,7 @@ def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give()
         AtWaypoints("above", HalfSpace(vec(-1.0, 0.0), num(-0.1))),
     ]
     x, warm = solve(d, z, pin(z, 0), walls)
-    assert warm.soft.tolist() == [True]
+    assert warm.infeasible.tolist() == [True]
     torch.testing.assert_close(
         x[0, 1:, 0], vec(0.05, 0.05), atol=1e-4, rtol=0
     )  # the way there has a cost too: 1e-5
@@ -167,7 +171,7 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
     d = maze()
     _, z = noisy_path(d, 9, 6, 40)
     z[:, 0, :2] -= 0.5
-    part = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.2))
+    part = OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.2))
     whole, _ = solve(d, z, pin(z, 0), [part, wall(0.3)])
     alone = torch.cat([solve(d, one[None], pin(one[None], 0), [part, wall(0.3)])[0] for one in z])
     torch.testing.assert_close(whole, alone, atol=1e-8, rtol=0)
@@ -185,7 +189,7 @@ def test_half_spaces_at_states_of_three_coordinates():
         None,
         z,
         pin(z, 0),
-        used=(1, 2, 3),
+        columns=(1, 2, 3),
         weight=WEIGHT,
         rounds=1,
         tolerance=1e-9,
@@ -210,7 +214,7 @@ def test_what_has_no_rows_is_met_by_admm_around_the_active_set():
     def onto(x, _):
         return torch.stack((x[..., 0], x[..., 1].clamp(-0.04, 0.04)), -1)
 
-    x, _ = solve(d, z, pin(z, 0), rest=onto, rounds=2000, tolerance=1e-7)
+    x, _ = solve(d, z, pin(z, 0), others=onto, rounds=2000, tolerance=1e-7)
     torch.testing.assert_close(x[..., :2], expected[..., :2], atol=1e-4, rtol=0)
 
 

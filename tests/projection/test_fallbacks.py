@@ -9,7 +9,7 @@ from cdiff_cli.constraints.state_sets import HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import Constraint, stack
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.projection.infeasible import FILTERED
+from cdiff_cli.projection.infeasible import MAX_FILTERED
 from cdiff_cli.projection.project import project
 from tests.problems import (
     F64,
@@ -34,7 +34,7 @@ from tests.problems import (
 def test_inside_a_ball_and_a_half_space_ends_on_both():
     g = stack(
         [
-            waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0), "b"),
+            waypoints(ball("inside", centre=(0.0, 0.0), radius=1.0), "b"),
             waypoints(HalfSpace(vec(1.0, 0.0), num(0.6)), "h"),
         ]
     )
@@ -47,8 +47,8 @@ def test_inside_a_ball_and_a_half_space_ends_on_both():
 def test_outside_two_balls_is_feasible():
     g = stack(
         [
-            waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "a"),
-            waypoints(ball(1, centre=(1.5, 0.0), radius=1.0), "b"),
+            waypoints(ball("outside", centre=(0.0, 0.0), radius=1.0), "a"),
+            waypoints(ball("outside", centre=(1.5, 0.0), radius=1.0), "b"),
         ]
     )
     x = free_projection(g, normal(2, 6, 4, 2, scale=0.8))
@@ -65,7 +65,10 @@ def test_opaque_ball_falls_back_to_linearisation_and_agrees():
     z = normal(4, 3, 2, 2, scale=2.0)
     x = free_projection(opaque(lambda x: x.square().sum(-1) - 1), z)
     torch.testing.assert_close(
-        x, free_projection(waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0)), z), atol=QP, rtol=0
+        x,
+        free_projection(waypoints(ball("inside", centre=(0.0, 0.0), radius=1.0)), z),
+        atol=QP,
+        rtol=0,
     )  # convex: the same
 
 
@@ -78,7 +81,7 @@ def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
 
 
 def test_dcbf_over_an_ellipsoid_is_reached_by_linearisation():
-    g, z = chain(ellipsoid(-1), 0.5), normal(6, 2, 3, 2)
+    g, z = chain(ellipsoid("inside"), 0.5), normal(6, 2, 3, 2)
     assert float(g(free_projection(g, z)).max()) <= 1e-5  # what project promises
 
 
@@ -103,7 +106,7 @@ def _slab(name, low, high):
 def test_of_two_slabs_that_exclude_each_other_and_a_disc_only_the_two_sides_between_them_are_named(
     order,
 ):
-    disc = waypoints(ball(1, centre=(0.0, 3.0), radius=0.5), "disc")
+    disc = waypoints(ball("outside", centre=(0.0, 3.0), radius=0.5), "disc")
     parts = [_slab("near", -1.0, 1.0), disc, _slab("far", 2.0, 3.0)]
     with pytest.raises(InfeasibleError) as caught:
         free_projection(stack([parts[i] for i in order]), normal(5, 1, 4, 2))
@@ -114,7 +117,7 @@ def test_of_two_slabs_that_exclude_each_other_and_a_disc_only_the_two_sides_betw
 
 
 def test_of_more_parts_than_are_left_out_in_turn_the_conflicting_ones_are_still_among_those_named():
-    many = [_slab(f"slab{i}", -1.0 - i, 1.0 + i) for i in range(FILTERED)]
+    many = [_slab(f"slab{i}", -1.0 - i, 1.0 + i) for i in range(MAX_FILTERED)]
     with pytest.raises(InfeasibleError, match=r"slab0\.high.*far\.low"):
         free_projection(stack([*many, _slab("far", 1.5, 3.0)]), torch.zeros(1, 1, 2, dtype=F64))
 

@@ -62,11 +62,11 @@ def test_half_space_moves_along_its_normal():
 @pytest.mark.parametrize(
     ("side", "start", "end"),
     [
-        (1, (0.5, 0.0), (2.0, 0.0)),
-        (1, (0.0, 3.0), (0.0, 3.0)),
-        (1, (0.0, 0.0), (2.0, 0.0)),  # the centre goes along the first axis
-        (-1, (3.0, 4.0), (1.2, 1.6)),
-        (-1, (0.5, 0.0), (0.5, 0.0)),
+        ("outside", (0.5, 0.0), (2.0, 0.0)),
+        ("outside", (0.0, 3.0), (0.0, 3.0)),
+        ("outside", (0.0, 0.0), (2.0, 0.0)),  # the centre goes along the first axis
+        ("inside", (3.0, 4.0), (1.2, 1.6)),
+        ("inside", (0.5, 0.0), (0.5, 0.0)),
     ],
 )
 def test_ball_moves_radially_to_its_sphere(side, start, end):
@@ -77,14 +77,15 @@ def test_ball_moves_radially_to_its_sphere(side, start, end):
 
 
 def test_ball_leaves_coordinates_it_does_not_name():
-    level = Ellipsoid(torch.eye(2, 4, dtype=F64), vec(0.0, 0.0), vec(1.0, 1.0), num(1.0), 1)
+    level = Ellipsoid(torch.eye(2, 4, dtype=F64), vec(0.0, 0.0), vec(1.0, 1.0), num(1.0), "outside")
     x = free_projection(waypoints(level), vec(0.5, 0.0, 7.0, -7.0).reshape(1, 1, 4))
     torch.testing.assert_close(x.flatten(), vec(1.0, 0.0, 7.0, -7.0), atol=1e-15, rtol=0)
 
 
 def test_centre_of_an_ellipsoid_leaves_along_its_short_axis():
     x = free_projection(
-        waypoints(ellipsoid(1, centre=(0.0, 0.0), axes=(3.0, 1.0))), torch.zeros(1, 1, 2, dtype=F64)
+        waypoints(ellipsoid("outside", centre=(0.0, 0.0), axes=(3.0, 1.0))),
+        torch.zeros(1, 1, 2, dtype=F64),
     )
     torch.testing.assert_close(
         x.abs().flatten(), vec(0.0, 1.0), atol=2e-6, rtol=0
@@ -134,7 +135,7 @@ def test_chain_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon
 def test_a_plan_at_the_centre_of_a_ball_leaves_it_as_slowly_as_the_barrier_allows():
     z = torch.zeros(1, 3, 2, dtype=F64)
     x = free_projection(
-        chain(ball(1, centre=(0.0, 0.0), radius=1.0), 0.5), z
+        chain(ball("outside", centre=(0.0, 0.0), radius=1.0), 0.5), z
     )  # h = |x| - 1 >= -1: -1, -1/2, -1/4
     torch.testing.assert_close(x.norm(dim=-1), vec(0.0, 0.5, 0.75)[None], atol=1e-14, rtol=0)
 
@@ -351,7 +352,7 @@ def test_saddle_projection_is_global_though_two_branches_are_near():
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_chain_over_a_ball_exterior_is_feasible_and_optimal_against_brute_force(alpha, seed):
-    level = ball(1, centre=(0.0, 0.0), radius=1.0)
+    level = ball("outside", centre=(0.0, 0.0), radius=1.0)
     z = normal(seed, 1, 3, 2, scale=0.7)
     g = chain(level, alpha)
     x = free_projection(g, z)
@@ -370,7 +371,7 @@ def test_chain_over_a_ball_exterior_is_feasible_and_optimal_against_brute_force(
 
 @pytest.mark.parametrize("pinned", [False, True])
 def test_chain_over_a_ball_leaves_a_pinned_start(pinned):
-    level = ball(1, centre=(0.0, 0.0), radius=1.0)
+    level = ball("outside", centre=(0.0, 0.0), radius=1.0)
     z = vec(2.0, 0.0, 0.5, 0.1, 0.2, -0.4, 0.0, 0.1).reshape(1, 4, 2)
     g = chain(level, 0.3)
     x = project(g, z, pin(z, 0) if pinned else Pins.none(z))

@@ -237,7 +237,7 @@ def test_a_disc_a_wall_and_a_limit_hold_together():
     z = torch.stack((s, 0.2 + 0 * s), -1)[None]
     g = stack(
         [
-            segments(ball(1, centre=(0.0, 0.0), radius=0.5)),
+            segments(ball("outside", centre=(0.0, 0.0), radius=0.5)),
             waypoints(half_space((0.0, 1.0), 0.9), "wall"),
         ]
     )

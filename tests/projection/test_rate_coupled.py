@@ -8,7 +8,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdiff_cli.constraints.rate import refuse_contradiction
+from cdiff_cli.constraints.rate import check_rates
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.errors import InfeasibleError
 from cdiff_cli.projection.project import project
@@ -100,11 +100,13 @@ def test_limits_that_contradict_each_other_are_refused_by_name(kind):
 
 
 def test_limits_that_leave_one_change_are_no_contradiction():
-    refuse_contradiction(
-        (
-            rate(2, (0, 1), norm=True),
-            rate(2, (1,), low=1.0, high=None),
-            rate(2, (0,), low=-1.0, high=1.0),
+    check_rates(
+        Constraint(
+            (
+                rate(2, (0, 1), norm=True),
+                rate(2, (1,), low=1.0, high=None),
+                rate(2, (0,), low=-1.0, high=1.0),
+            )
         )
     )
 

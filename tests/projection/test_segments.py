@@ -15,15 +15,16 @@ from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, stack
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.projection.project import REFINEMENTS, project
-from cdiff_cli.projection.segments import NEVER, nearest_in_planes, normals, planes
+from cdiff_cli.projection.project import project
+from cdiff_cli.projection.segments import MAX_CHOICES, normals, tangent_half_spaces
+from cdiff_cli.projection.solvers.half_spaces import NEVER, HalfSpaces, nearest_in_half_spaces
 from tests.problems import F64, ball, chain, least_distance, normal, num, pin, vec, waypoints
 
 SAFE = {
     F64: 1e-9,
     torch.float32: 1e-5,
 }  # rounding of coordinates of a few metres, in units of the smallest radius, 0.2
-UNIT = ball(1, centre=(0.0, 0.0), radius=1.0)
+UNIT = ball("outside", centre=(0.0, 0.0), radius=1.0)
 quick = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 10_000)
 
@@ -33,7 +34,7 @@ def segments(level, name="s"):
 
 
 def outside(k, radius, dim=None):
-    return ball(1, centre=(0.0,) * k, radius=radius, dim=dim)
+    return ball("outside", centre=(0.0,) * k, radius=radius, dim=dim)
 
 
 def free(g, z):
@@ -114,7 +115,7 @@ def test_a_lone_segment_across_moves_both_ends_to_the_tangent():
 def test_an_affine_change_makes_an_ellipsoid_a_ball():
     axes = vec(2.0, 0.5)
     level, s = (
-        Ellipsoid(torch.eye(2, dtype=F64), vec(0.3, -0.1), axes, num(0.5), 1),
+        Ellipsoid(torch.eye(2, dtype=F64), vec(0.3, -0.1), axes, num(0.5), "outside"),
         torch.linspace(-3, 3, 31, dtype=F64),
     )
     z = torch.stack((s, 0.1 + 0 * s), -1)[None]
@@ -133,18 +134,18 @@ def test_coordinates_that_the_ball_does_not_name_stay():
 
 def test_a_half_space_is_a_plane_of_every_waypoint_unchanged():
     wall, z = HalfSpace(vec(1.0, 2.0), num(0.7)), normal(0, 2, 3, 2)
-    a, b = planes((AtWaypoints("w", wall),), z, Pins.none(z))
+    a, b = tangent_half_spaces((AtWaypoints("w", wall),), z, Pins.none(z))
     assert torch.equal(a, wall.a.expand(2, 3, 1, 2))
     assert torch.equal(b, wall.b.expand(2, 3, 1))
 
 
 def test_the_planes_of_a_disc_are_tangent_and_none_stands_beyond_the_ends():
     z = normal(0, 2, 5, 2)
-    a, b = planes(segments(ball(1)).parts, z, Pins.none(z))
+    a, b = tangent_half_spaces(segments(ball("outside")).parts, z, Pins.none(z))
     assert bool((b[:, 0, 0] == NEVER).all())
     assert bool((b[:, -1, 1] == NEVER).all())
     assert torch.equal(a[:, 1:, 0], a[:, :-1, 1])  # a segment's plane holds at both of its ends
-    away = (b[:, 1:, 0] - a[:, 1:, 0] @ ball(1).centre) / a[:, 1:, 0].norm(dim=-1)
+    away = (b[:, 1:, 0] - a[:, 1:, 0] @ ball("outside").centre) / a[:, 1:, 0].norm(dim=-1)
     torch.testing.assert_close(away, torch.full_like(away, -0.7), atol=1e-12, rtol=0)
 
 
@@ -174,8 +175,8 @@ def test_two_pinned_ends_on_opposite_sides_of_a_disc_leave_a_lone_segment_no_way
 def test_two_discs_are_both_avoided():
     g = stack(
         [
-            segments(ball(1, centre=(0.0, 0.0), radius=1.0), "a"),
-            segments(ball(1, centre=(2.6, 0.5), radius=0.8), "b"),
+            segments(ball("outside", centre=(0.0, 0.0), radius=1.0), "a"),
+            segments(ball("outside", centre=(2.6, 0.5), radius=0.8), "b"),
         ]
     )
     s = torch.linspace(-2, 5, 60, dtype=F64)
@@ -197,15 +198,17 @@ def test_a_disc_and_a_wall_are_obeyed_at_once():
 
 BESIDE = {
     "inside a larger disc": (
-        segments(ball(1, centre=(0.0, 0.0), radius=0.5)),
-        waypoints(ball(-1, centre=(0.0, 0.0), radius=2.1)),
+        segments(ball("outside", centre=(0.0, 0.0), radius=0.5)),
+        waypoints(ball("inside", centre=(0.0, 0.0), radius=2.1)),
     ),
     "a chain over a wall": (
-        segments(ball(1, centre=(0.0, 0.0), radius=0.5)),
+        segments(ball("outside", centre=(0.0, 0.0), radius=0.5)),
         chain(HalfSpace(vec(0.0, 1.0), num(0.8)), 0.3),
     ),
     "a chain over the same disc": (
-        Constraint(chain(ball(1, centre=(0.0, 0.0), radius=0.5), 0.3).parts[0].on_segments()),
+        Constraint(
+            chain(ball("outside", centre=(0.0, 0.0), radius=0.5), 0.3).parts[0].on_segments()
+        ),
     ),
 }
 
@@ -219,7 +222,9 @@ def test_chains_and_discs_to_stay_in_hold_beside_a_disc_to_go_round(case, dtype)
     g = stack(list(BESIDE[case])).to(z)
     x = project(g, z, pin(z, 0, 63))
     assert float(g(x).max()) <= (1e-7 if dtype == F64 else 2e-4)  # what project promises
-    around = project(segments(ball(1, centre=(0.0, 0.0), radius=0.5)).to(z), z, pin(z, 0, 63))
+    around = project(
+        segments(ball("outside", centre=(0.0, 0.0), radius=0.5)).to(z), z, pin(z, 0, 63)
+    )
     assert float((x - z).norm()) <= 1.2 * float(
         (around - z).norm()
     )  # hardly further than for the disc alone
@@ -313,8 +318,8 @@ def test_choosing_the_planes_again_never_takes_the_path_further_away(
 ):
     z = random_path(kind, seed, 3, horizon, k).to(dtype)
     g, pins, x, last = segments(outside(k, radius)).to(z), Pins.none(z), z, None
-    for _ in range(2 * REFINEMENTS):
-        x = nearest_in_planes(z, planes(g.parts, x, pins), pins)
+    for _ in range(2 * MAX_CHOICES):
+        x = nearest_in_half_spaces(z, tangent_half_spaces(g.parts, x, pins), pins.held)
         now = (x - z).norm(dim=(1, 2))
         rounding = (
             1e-7 if dtype == F64 else 3e-3
@@ -346,7 +351,7 @@ def test_the_nearest_point_in_half_planes_is_the_least_distance_and_has_multipli
         normal(seed + 1, 2, 4, m).abs() + 0.2,
         normal(seed + 2, 2, 4, 2, scale=2.0),
     )
-    x = nearest_in_planes(z, (a, b), Pins.none(z))
+    x = nearest_in_half_spaces(z, HalfSpaces(a, b), Pins.none(z).held)
     assert float(((a * x[:, :, None]).sum(-1) - b).max()) <= 1e-9
     for i in range(2):
         for tau in range(4):
@@ -365,9 +370,8 @@ def test_the_nearest_point_in_half_planes_is_the_least_distance_and_has_multipli
 
 def test_pinned_waypoints_do_not_heed_the_planes():
     z = normal(0, 1, 3, 2) + 5.0
-    x = nearest_in_planes(
-        z, (torch.ones(1, 3, 1, 2, dtype=F64), torch.zeros(1, 3, 1, dtype=F64)), pin(z, 1)
-    )
+    half_spaces = HalfSpaces(torch.ones(1, 3, 1, 2, dtype=F64), torch.zeros(1, 3, 1, dtype=F64))
+    x = nearest_in_half_spaces(z, half_spaces, pin(z, 1).held)
     assert torch.equal(x[:, 1], z[:, 1])
     torch.testing.assert_close(
         x[:, [0, 2]].sum(-1), torch.zeros(1, 2, dtype=F64), atol=1e-12, rtol=0

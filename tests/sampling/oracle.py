@@ -152,7 +152,11 @@ def _half_space(x: float, y: float, b: float) -> HalfSpace:
 def _outside(x: float, y: float, radius: float) -> Ellipsoid:
     one = torch.ones(2, dtype=F64)
     return Ellipsoid(
-        torch.eye(2, dtype=F64), torch.tensor([x, y], dtype=F64), radius * one, radius * one[0], 1
+        torch.eye(2, dtype=F64),
+        torch.tensor([x, y], dtype=F64),
+        radius * one,
+        radius * one[0],
+        "outside",
     )
 
 

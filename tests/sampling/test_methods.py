@@ -242,7 +242,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
     """
     s = torch.linspace(-2, 2, horizon, dtype=F64)
     line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
-    g = Constraint((OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    g = Constraint((OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),))
     noise = draws(11, 1, horizon, 2)
     return sample(
         gaussian_denoiser(SCHEDULE, line, 1e-3),
@@ -276,7 +276,7 @@ def test_multipliers_of_segments_keep_their_number_and_pins_stay(name, on, expec
     g = Constraint(
         (
             AtWaypoints("wall", half_space()),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),
         )
     )
     method = make_method(name, {"on": on, "expectation": expectation})
@@ -325,7 +325,7 @@ def test_every_method_gets_the_same_noise():
 
 def test_silu_replaces_g_by_its_smooth_positive_part_and_its_slope():
     x = normal(4, 3, 2, 2)
-    g = waypoints(ball(1))
+    g = waypoints(ball("outside"))
     lam = normal(5, 3, 2).abs()
     leaf = x.clone().requires_grad_()
     smooth = torch.nn.functional.silu(g(leaf))

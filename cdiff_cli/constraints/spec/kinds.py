@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.hocbf import second_order
+from cdiff_cli.constraints.protocol import StateSet
 from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.sets import (
     Coordinates,
@@ -27,7 +28,7 @@ from cdiff_cli.constraints.spec.sets import (
     observed_or_not,
     vector,
 )
-from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, StateSet
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.yaml_files import Strict
 

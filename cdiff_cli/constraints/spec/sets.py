@@ -8,7 +8,8 @@ from pydantic import Field, PlainSerializer, WithJsonSchema, WrapValidator, mode
 from torch import Tensor
 
 from cdiff_cli.constraints.observed import Observed, ObservedValues, carried
-from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, StateSet
+from cdiff_cli.constraints.protocol import StateSet
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.yaml_files import Strict
@@ -163,14 +164,14 @@ class Quadratic(Strict):
         )
 
     def level(self, layout: Layout, seen: ObservedValues = NOTHING) -> StateSet:
-        side = 1 if self.side == "outside" else -1
+        sign = 1 if self.side == "outside" else -1
         if self.P is not None:
             assert self.r is not None
             P = torch.stack([vector(self.P.get(row, {}), layout) for row in layout])
             return Quadric(
-                -side * (P + P.T) / 2,
-                -side * vector(self.q or {}, layout, seen),
-                -side * _filled(self.r, seen),
+                -sign * (P + P.T) / 2,
+                -sign * vector(self.q or {}, layout, seen),
+                -sign * _filled(self.r, seen),
             )
         assert self.centre is not None
         names = [name for name in layout if name in self.centre]
@@ -179,9 +180,9 @@ class Quadratic(Strict):
         which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
         m = axes.amin(-1)
         if self.form == "distance":
-            return Ellipsoid(which, centre, axes, m, side)
+            return Ellipsoid(which, centre, axes, m, self.side)
         around = Quadric(
-            -side * which.T @ which, torch.zeros(len(layout), dtype=torch.float64), -side * m**2
+            -sign * which.T @ which, torch.zeros(len(layout), dtype=torch.float64), -sign * m**2
         )  # m^2 - |x|^2
         to_ball = m[..., None] / axes
         return around.pull_back(-(centre * to_ball) @ which, to_ball @ which + (1 - which.sum(0)))

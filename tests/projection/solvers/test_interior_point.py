@@ -161,7 +161,15 @@ def test_rates_of_single_coordinates_beside_dynamics_end_where_proxqp_does(seed,
     )
     pins = pin(z, 0, -1) if goal else pin(z, 0)
     x, made = project_rate_dynamics(
-        PUSHED, [wall], rates, z, pins, used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+        PUSHED,
+        [wall],
+        rates,
+        z,
+        pins,
+        columns=range(4),
+        weight=WEIGHT,
+        max_choices=1,
+        tolerance=1e-9,
     )
     torch.testing.assert_close(PUSHED.rollout(still, made), x, atol=1e-9, rtol=0)
     assert any(float(one(x).max()) > -1e-6 for one in rates)
@@ -205,7 +213,15 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
 
     def paced(z):
         return project_rate_dynamics(
-            PUSHED, [], limits, z, pin(z, 0), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+            PUSHED,
+            [],
+            limits,
+            z,
+            pin(z, 0),
+            columns=range(4),
+            weight=WEIGHT,
+            max_choices=1,
+            tolerance=1e-9,
         )[0]
 
     together = paced(z)
@@ -221,7 +237,15 @@ def test_where_the_goal_is_too_far_the_limits_hold_and_the_goal_is_missed():
     z[:, :, 0] = torch.linspace(0, 1, 30, dtype=F64)
     limits = [rate(4, (0, 1), high=0.2, norm=True, dt=DT)]
     x, u = project_rate_dynamics(
-        PUSHED, [], limits, z, pin(z, 0, -1), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+        PUSHED,
+        [],
+        limits,
+        z,
+        pin(z, 0, -1),
+        columns=range(4),
+        weight=WEIGHT,
+        max_choices=1,
+        tolerance=1e-9,
     )
     assert float(limits[0](x).max()) <= 1e-4  # of the limits, as far as they give way
     assert float(u.abs().max()) <= 1 + 1e-4
@@ -231,6 +255,14 @@ def test_where_the_goal_is_too_far_the_limits_hold_and_the_goal_is_missed():
 def test_nothing_to_plan_comes_back():
     for z in (torch.zeros(0, 5, 4, dtype=F64), torch.zeros(2, 1, 4, dtype=F64)):
         x, u = project_rate_dynamics(
-            PUSHED, [], [], z, Pins.none(z), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+            PUSHED,
+            [],
+            [],
+            z,
+            Pins.none(z),
+            columns=range(4),
+            weight=WEIGHT,
+            max_choices=1,
+            tolerance=1e-9,
         )
         assert (x.shape, u.shape) == (z.shape, (len(z), z.shape[1] - 1, 2))
