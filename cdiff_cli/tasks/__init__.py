@@ -1,9 +1,12 @@
 """The shipped tasks: a literal table from name to module."""
 
 import importlib
+from typing import TYPE_CHECKING
 
 from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.tasks.protocol import Task
+
+if TYPE_CHECKING:
+    from cdiff_cli.tasks.protocol import Task
 
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
@@ -15,7 +18,7 @@ TASKS = {
 }
 
 
-def load_task(name: str) -> Task:
+def load_task(name: str) -> "Task":
     """The task of that name; CdiffError with a suggestion if there is none."""
     if name not in TASKS:
         raise CdiffError(
