@@ -5,6 +5,7 @@ import hashlib
 import platform
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
@@ -48,6 +49,9 @@ def run_again(
     from cdiff_cli.commands.summary import rollout_table
     from cdiff_cli.evaluation.columns import PLAN_TABLE
 
+    for name in options:
+        if name not in {field.name for field in fields(Request)}:
+            raise document.error(("options", name), f'no option "{name}" in this version of cdiff')
     request = cast(Any, document.read(create_model("Run", options=(Request, ...)))).options
     with _threads(record.get("device")):
         experiment = resolve(request)

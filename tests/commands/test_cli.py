@@ -1,6 +1,7 @@
 """The command line as typed: exit codes, content, what is on disk afterwards."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +44,7 @@ def test_plan_with_alm_prints_its_table_and_picture(alm_run):
         "n = 2",
         "distance / m",
         "worst segment / g",
-        "network calls a plan",
+        "network calls per plan",
         "plan.png",
     ):
         assert word in stdout
@@ -437,16 +438,89 @@ def test_help_names_every_task_and_what_is_taken_where_nothing_is_said():
     assert "YAML file of constraints [default: the task's own]" in shown
 
 
+COMMANDS = {*("plan", "rollout", "verify", "compare", "sweep", "rerun", "check", "list", "train")}
+WITHOUT_TORCH = """
+import sys
+from typer.testing import CliRunner
+from cdiff_cli.cli import app
+result = CliRunner().invoke(app, sys.argv[2:])
+assert result.exit_code == int(sys.argv[1]), result.output + result.stderr
+assert "torch" not in sys.modules
+print(result.output)
+"""
+
+
+def without_torch(*words, code=0):
+    """What a new process prints, which must not have imported torch."""
+    program = [sys.executable, "-c", WITHOUT_TORCH, str(code), *map(str, words)]
+    run = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
 def test_help_names_every_command_and_imports_no_torch():
-    program = (
-        "import sys; from typer.testing import CliRunner; from cdiff_cli.cli import app; "
-        "print(CliRunner().invoke(app, ['--help']).output); assert 'torch' not in sys.modules"
+    shown = without_torch("--help")
+    assert [name for name in COMMANDS if f"│ {name} " not in shown] == []
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_of_each_command_has_an_example_with_options_that_exist(command):
+    shown = cdiff(command, "-h").stdout
+    assert shown == cdiff(command, "--help").stdout
+    (example,) = [line.strip() for line in shown.splitlines() if "Example: cdiff" in line]
+    cdiff(*example.removeprefix("Example: cdiff ").split(), "--help")
+
+
+def test_options_stand_in_panels():
+    shown = cdiff("rollout", "-h").stdout
+    panels = [line.split("─ ")[1].split(" ─")[0] for line in shown.splitlines() if "╭─" in line]
+    assert panels == ["Options", "Task", "Constraint", "Sampling", "Execution", "Output"]
+
+
+def test_version_is_that_of_the_package():
+    import cdiff_cli
+
+    assert cdiff("--version").stdout == f"cdiff {cdiff_cli.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("cdiff plan --method pri", ["primal-dual"]),
+        ("cdiff plan --task maze", ["maze2d-umaze", "maze2d-large"]),
+        ("cdiff list m", ["methods", "models"]),
+        ("cdiff re", ["rerun"]),
+    ],
+)
+def test_shell_completes_commands_and_names(line, expected):
+    words = line.split()
+    variables = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    completed = subprocess.run(
+        [sys.executable, "-c", "from cdiff_cli.cli import app; app(prog_name='cdiff')"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | variables | {"_CDIFF_COMPLETE": "complete_bash"},
     )
-    shown = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    for command in ("train", "plan", "rollout", "verify", "compare", "check"):
-        assert command in shown
+    assert completed.stdout.split() == expected
+
+
+MISSPELT = {
+    "task": (["plan", "--task", "maze2d-umase"], 'no task "maze2d-umase" (did you mean'),
+    "method": (["plan", "--method", "almm"], 'no method "almm" (did you mean "alm"?)'),
+    "preset": (["rollout", "--preset", "papr"], 'no preset "papr" (did you mean "paper"?)'),
+    "kernel": (["rollout", "--kernel", "dim"], 'no kernel "dim" (did you mean "ddim"?)'),
+    "format": (["compare", "--format", "cvs"], 'no format "cvs" (did you mean "csv"?)'),
+    "sweep": (["sweep", "--methods", "alm,almm"], '--methods: no method "almm"'),
+    "train": (["train", "--recipe", "smal"], 'no recipe "smal" (did you mean "small"?)'),
+    "list": (["list", "taks"], 'no list "taks" (did you mean "tasks"?)'),
+}
+
+
+@pytest.mark.parametrize("name", MISSPELT)
+def test_misspelt_name_is_refused_before_torch_is_imported(name):
+    words, message = MISSPELT[name]
+    assert message in without_torch(*words, code=2)
 
 
 @pytest.mark.parametrize("task", ["maze2d-umaze", "maze2d-large", "gaussian2d"])
