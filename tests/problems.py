@@ -40,7 +40,7 @@ def normal(seed, *shape, scale=1.0):
     return scale * torch.randn(*shape, generator=generator(seed), dtype=F64)
 
 
-# levels and constraints -----------------------------------------------------------------------------------------------
+# levels and constraints ---------------------------------------------------------------------------
 
 
 def half_space(a=(1.0, -1.0), b=0.2):
@@ -107,7 +107,7 @@ KINDS = {
 }
 
 
-# pins -----------------------------------------------------------------------------------------------------------------
+# pins ---------------------------------------------------------------------------------------------
 
 
 def pin(x, *waypoints, columns=None):
@@ -118,7 +118,7 @@ def pin(x, *waypoints, columns=None):
     return Pins(mask, x)
 
 
-# references -----------------------------------------------------------------------------------------------------------
+# references ---------------------------------------------------------------------------------------
 
 
 def qp_project(A, b, z, fixed=None):
@@ -159,7 +159,7 @@ def nearest_of(points, z):
     return torch.cdist(z, points).min(1).values
 
 
-# samplers with known answers ------------------------------------------------------------------------------------------
+# samplers with known answers ----------------------------------------------------------------------
 
 UNIT_MEAN_SHIFT = waypoints(
     HalfSpace(vec(-1.0), num(-1.0))

@@ -28,7 +28,7 @@ class AffineRows:
         return self(x), lambda w: (w @ self.A).view(-1, *x.shape[1:]), self.size
 
     def about(self, centre: Tensor, like: Tensor) -> "AffineRows":
-        """The same rows as a function of y, x = centre + y, in the dtype and on the device of `like`.
+        """The rows as a function of y, x = centre + y, in the dtype and on the device of `like`.
 
         centre   [batch, horizon, dim]
         """

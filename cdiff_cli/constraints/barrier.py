@@ -27,8 +27,8 @@ class DiscreteBarrier:
 
     level    the state set whose barrier h must stay non-negative
     alpha2   second factor of a high-order barrier; None for the plain one
-    ahead    the state set that the rows use, where it is not `level`: at the place that the velocity
-             leads to
+    ahead    the state set that the rows use, where it is not `level`: at the place to which the
+             velocity leads
     """
 
     name: str

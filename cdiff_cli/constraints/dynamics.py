@@ -38,7 +38,7 @@ class LinearDynamics:
         return LinearDynamics(*(v.to(like) for v in (self.A, self.B, self.c, self.low, self.high)))
 
     def rollout(self, x0: Tensor, u: Tensor) -> Traj:
-        """The states from x0 [batch, n] under inputs u [batch, horizon - 1, m]: [batch, horizon, n]."""
+        """The states [batch, horizon, n] from x0 [batch, n] under u [batch, horizon - 1, m]."""
         x, power, reach = torch.cat((x0[:, None], u @ self.B.T + self.c), 1), self.A, 1
         while reach < x.shape[1]:  # x holds the contribution of the last `reach` steps per state
             x = torch.cat((x[:, :reach], x[:, reach:] + x[:, :-reach] @ power.T), 1)
@@ -88,7 +88,7 @@ class LinearDynamicsConstraint:
     def from_dynamics(
         cls, name: str, dynamics: LinearDynamics, tolerance: float
     ) -> "LinearDynamicsConstraint":
-        """The constraint on trajectories in environment units, with weight 1 for every coordinate."""
+        """The constraint in environment units, with weight 1 for every coordinate."""
         one = torch.ones_like(dynamics.c)
         return cls(name, dynamics, torch.zeros_like(one), one, one, tolerance)
 

@@ -20,9 +20,9 @@ class BallHOCBF:
 
         h = |y| - radius,  y = which x - centre,   dh/dt = (y / |y|).w,  w = rates x - drift
 
-    A path with psi >= 0 has h(t) >= h(0) e^(-t / time), so a path that starts outside never enters. The
-    relative degree is 2 (Xiao and Belta, 2019): psi depends on the velocity of one waypoint, so a force
-    changes psi within one step, whereas it changes h only steps later.
+    A path with psi >= 0 has h(t) >= h(0) e^(-t / time), so a path that starts outside never enters.
+    The relative degree is 2 (Xiao and Belta, 2019): psi depends on the velocity of one waypoint, so
+    a force changes psi within one step, whereas it changes h only steps later.
 
     which, centre   relative position in metres                [k, dim], [k]
     rates, drift    relative velocity in metres per second     [k, dim], [k]

@@ -22,7 +22,7 @@ class Observed:
     """A part that is known once its quantities are observed; `bind` then returns it.
 
     names    the quantities
-    make     (observed quantities, seconds between waypoints, horizon) -> the part, environment units
+    make     (observed quantities, seconds between waypoints, horizon) -> the part
     changes  operations on the part that bind applies in order, such as pull_back and tighten
     """
 

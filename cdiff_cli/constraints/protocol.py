@@ -1,9 +1,9 @@
 """What every state set answers, and what can be computed for all of them.
 
-A state set is {x : f(x) <= 0} for a scalar function f of one state. Its parameters may differ by plan
-and by waypoint: each tensor has the shape that its class documents, or [horizon | 1] or
-[batch | 1, horizon | 1] in front of it. A set with such leading dimensions applies to trajectories
-[batch, horizon, dim]; a set without them applies to states of any shape [..., dim].
+A state set is {x : f(x) <= 0} for a scalar function f of one state. Its parameters may differ by
+plan and by waypoint: each tensor has the shape that its class documents, or [horizon | 1] or [batch
+| 1, horizon | 1] in front of it. A set with such leading dimensions applies to trajectories [batch,
+horizon, dim]; a set without them applies to states of any shape [..., dim].
 """
 
 from collections.abc import Callable, Sequence
@@ -19,9 +19,9 @@ D = TypeVar("D")
 class SegmentPoints(NamedTuple):
     """The function f at one point of each segment of a trajectory [..., horizon, dim].
 
-    value      f at the point                                                  [..., horizon - 1]
-    back, on   derivatives by the segment's first and last waypoint            [..., horizon - 1, dim]
-    size       |back|^2 + |on|^2, plus |f| times the curvature (step_bound)    [..., horizon - 1]
+    value      f at the point                                            [..., horizon - 1]
+    back, on   derivatives by the segment's first and last waypoint      [..., horizon - 1, dim]
+    size       |back|^2 + |on|^2 + |f| times the curvature (step_bound)  [..., horizon - 1]
     """
 
     value: Tensor
@@ -86,7 +86,7 @@ class StateSet(Protocol):
 
 
 def segment_max(level: StateSet, x: Tensor) -> Tensor:
-    """The largest f on the segments of trajectories [..., horizon, dim], exactly [..., horizon - 1]."""
+    """The exact maximum of f per segment [..., horizon - 1] of trajectories [..., horizon, dim]."""
     f = level(x)
     at_ends = torch.maximum(f[..., :-1], f[..., 1:])  # rounding must not hide an unsafe end
     return torch.maximum(at_ends, level.on_segment(x, level.segment_argmax(x)).value)

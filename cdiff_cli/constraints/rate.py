@@ -1,7 +1,7 @@
 """Limits on how fast coordinates change between waypoints.
 
-The rate on a segment is (x^{tau+1} - x^tau) / dt. It is constant along a straight segment, so one row
-per segment is exact.
+The rate on a segment is (x^{tau+1} - x^tau) / dt. It is constant along a straight segment, so one
+row per segment is exact.
 """
 
 import math
@@ -160,7 +160,7 @@ def limits_of(g: Constraint) -> list[RateLimit]:
 
 
 def max_rate(g: Constraint, columns: set[int]) -> float:
-    """The largest length of the rate of these coordinates together that g allows; inf if unlimited."""
+    """The largest length of the rate of these coordinates that g allows; inf without a limit."""
     limits = [
         part.high
         for part in limits_of(g)

@@ -1,7 +1,7 @@
 """Sets of states: half-spaces, quadrics, balls and ellipsoids.
 
-Each is {x : f(x) <= 0} with the gradient of f written out, and with the point of a straight segment at
-which f is largest (protocol.py).
+Each is {x : f(x) <= 0} with the gradient of f written out, and with the point of a straight segment
+at which f is largest (protocol.py).
 """
 
 from collections.abc import Sequence
@@ -127,7 +127,7 @@ class Quadric:
         return replace(self, P=self.P[..., columns, :][..., columns], q=self.q[..., columns])
 
     def ball(self) -> "Ellipsoid | None":
-        """The same set as the outside of an axis-aligned ellipsoid, None where it is no such set."""
+        """The same set as the outside of an axis-aligned ellipsoid; None if it is not one."""
         diagonal = self.P.diagonal()
         curved = diagonal != 0
         aligned = bool(curved.any()) and bool((diagonal.diag() == self.P).all())
@@ -148,8 +148,8 @@ class Quadric:
 class QuadricInFrame:
     """f(x) = quadric(centre + scale * x), with a frame that differs by plan and waypoint.
 
-    The frame is kept rather than multiplied out, because a segment is straight in the coordinates of
-    the quadric, not in those of x.
+    The frame is kept rather than multiplied out, because a segment is straight in the coordinates
+    of the quadric, not in those of x.
     """
 
     quadric: Quadric
@@ -222,8 +222,8 @@ class QuadricInFrame:
 class Ellipsoid:
     """f(x) = sign * (m - m |(which x - centre) / axes|), with sign +1 outside and -1 inside.
 
-    A ball has all axes equal to its radius m, and f is the signed distance to its surface. For unequal
-    semi-axes m is the smallest one: |f| is then at most the distance to the surface.
+    A ball has all axes equal to its radius m, and f is the signed distance to its surface. For
+    unequal semi-axes m is the smallest one: |f| is then at most the distance to the surface.
 
     which    selects the coordinates that f acts on   [k, dim], unit rows that share no coordinate
     centre   environment units                        [k]
@@ -251,7 +251,7 @@ class Ellipsoid:
         return self.sign * self.m * (1 - self.scaled(x).norm(dim=-1))
 
     def scaled(self, x: Tensor) -> Tensor:
-        """Coordinates in which the surface is the unit sphere and segments are straight [..., k]."""
+        """Coordinates in which the surface is the unit sphere, segments straight [..., k]."""
         return (times(x, self.which.mT) - self.centre) / self.axes
 
     def gradient(self, x: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """Constraints g(x) <= 0 on trajectories, row by row.
 
-A constraint is a tuple of parts. A part applies a state set to the trajectory: at every waypoint, on the
-segments, or as a discrete control barrier function along it. Other parts limit rates of change or
-require linear dynamics. Gradients are written out, so that a method pays for a few vector operations
-and no autograd graph.
+A constraint is a tuple of parts. A part applies a state set to the trajectory: at every waypoint,
+on the segments, or as a discrete control barrier function along it. Other parts limit rates of
+change or require linear dynamics. Gradients are written out, so that a method pays for a few vector
+operations and no autograd graph.
 """
 
 from collections.abc import Mapping, Sequence
@@ -240,7 +240,7 @@ class Constraint:
         return torch.cat([lowest, *rows], 1).amax(1).numpy(force=True)
 
     def on_segments(self) -> "Constraint":
-        """The constraint that holds all along the segments, as far as the form of each part allows."""
+        """The constraint on whole segments, as far as the form of each part allows."""
         return Constraint(tuple(part for whole in self.parts for part in whole.on_segments()))
 
     def condense(self, horizon: int, dim: int) -> AffineRows | None:
@@ -276,7 +276,7 @@ def stack(constraints: Sequence[Constraint]) -> Constraint:
 def pull_back(g: Constraint, centre: Tensor, scale: Tensor) -> Constraint:
     """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their units.
 
-    centre, scale   [dim], or per plan and waypoint: [horizon | 1, dim] or [batch | 1, horizon | 1, dim]
+    centre, scale   [dim], or [horizon | 1, dim], or [batch | 1, horizon | 1, dim]
     """
     return Constraint(tuple(part.pull_back(centre, scale) for part in g.parts))
 

@@ -2,12 +2,12 @@
 
 The values of the barrier h are projected onto
 
-    h_{k+1} >= gamma h_k                                         plain: weighted isotonic regression
-    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0   high-order: a small quadratic program
+    h_{k+1} >= gamma h_k                                         plain: isotonic regression
+    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0   high-order: a small QP
 
-weighted by the distance that a waypoint moves per change of h. Each waypoint then moves to its new level
-set. Level sets of half-spaces are planes and those of balls are spheres, so the nearest point is along
-the normal and the result is the nearest trajectory.
+weighted by the distance that a waypoint moves per change of h. Each waypoint then moves to its new
+level set. Level sets of half-spaces are planes and those of balls are spheres, so the nearest point
+is along the normal and the result is the nearest trajectory.
 """
 
 import torch
@@ -118,8 +118,8 @@ def _nearest_under(
 ) -> Rows:
     """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0,  v_k = h_k outside first to last, by its dual.
 
-    Where the solution is below `low`, the least values that `low` and D allow replace it: feasible, if
-    not the nearest.
+    Where the solution is below `low`, the least values that `low` and D allow replace it: feasible,
+    if not the nearest.
     """
     one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
     D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)

@@ -4,8 +4,8 @@
                                   a.x <= b at waypoints,   start and goal pinned
 
 All plans of a batch are solved at once. Without the inequalities the solution is one product with a
-matrix that the batch shares (lq_tracking.py). The active inequalities are found by active_set.py, and
-the half-spaces a.x <= b around obstacles are chosen by segments.py.
+matrix that the batch shares (lq_tracking.py). The active inequalities are found by active_set.py,
+and the half-spaces a.x <= b around obstacles are chosen by segments.py.
 """
 
 from collections.abc import Callable, Sequence
@@ -111,14 +111,14 @@ def project_dynamics(
 ) -> tuple[Traj, ActiveSetWarmStart]:
     """The nearest trajectory to z that the dynamics produce from its first state, and a warm start.
 
-    The inputs stay within their bounds, the parts are satisfied, and a pinned last state is reached.
-    Where this is impossible, rows give way by slack (active_set.py).
+    The inputs stay within their bounds, the parts are satisfied, and a pinned last state is
+    reached. Where this is impossible, rows give way by slack (active_set.py).
 
     parts         act on the coordinates `columns` alone
     others        projection onto all other parts, on `columns`; None where there are none
     weight        weight per coordinate in |x - z|^2   [n]
-    rounds        rounds of ADMM, which is used where there are `others`; it ends earlier once its copy
-                  is within the tolerance
+    rounds        largest number of rounds of ADMM, which is used where there are `others`; it ends
+                  once its copy is within the tolerance
     max_choices   how often the half-spaces of a plan are chosen: first at its target, then at each
                   solution. Plans with a safe target get none. Plans that stay infeasible keep their
                   first choice.

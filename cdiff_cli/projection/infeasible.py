@@ -1,4 +1,4 @@
-"""Why no trajectory satisfies a constraint: pinned states that violate it, and parts in conflict."""
+"""Why no trajectory satisfies a constraint: pins that violate it, and parts in conflict."""
 
 import torch
 
@@ -16,8 +16,8 @@ FILTER_PROGRAMS = 10  # quadratic programs per part that is left out
 def check_pins(g: Constraint, pins: Pins, tolerance: float) -> None:
     """Raise InfeasibleError for what no free coordinate can repair.
 
-    That is rate limits that contradict each other, and pinned waypoints that alone violate a row by the
-    tolerance.
+    That is rate limits that contradict each other, and pinned waypoints that alone violate a row by
+    the tolerance.
     """
     check_rates(g)
     if not bool(pins.mask.any()) or pins.values.numel() == 0:
@@ -52,8 +52,8 @@ def _conflict(
 ) -> list[TrajectoryConstraint]:
     """Parts of g that, with the pins, leave no feasible point that sequential QP finds.
 
-    Without any one of them it finds a point. This is a deletion filter (Chinneck and Dravnieks, 1991)
-    over the first MAX_FILTERED parts; all further parts are returned too.
+    Without any one of them it finds a point. This is a deletion filter (Chinneck and Dravnieks,
+    1991) over the first MAX_FILTERED parts; all further parts are returned too.
     """
     kept = list(g.parts)
     for part in g.parts[:MAX_FILTERED]:

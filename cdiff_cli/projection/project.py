@@ -2,15 +2,15 @@
 
     P(z) = argmin |x - z|^2  s.t.  g(x) <= 0          (paper, the projection operator)
 
-half-space, ball, ellipsoid, quadric at waypoints    closed form, or one scalar root (state.py)
-segments outside balls and ellipsoids, half-spaces   tangent half-spaces, a local solution (segments.py)
-discrete barrier over a half-space or a ball         isotonic regression, or a small QP (barrier.py)
-limits on the rate of change                         ADMM on the differences (rate.py)
-limits on rates around balls and ellipsoids          interior points (rate_dynamics.py)
-linear dynamics with bounded inputs                  active set (dynamics.py), with rates interior
-                                                     points, with other parts ADMM; a local solution
-several of these together                            Dykstra's algorithm (dykstra.py)
-anything else                                        sequential QP by ProxQP (sequential_qp.py)
+half-space, ball, ellipsoid, quadric at waypoints   closed form, or one scalar root (state.py)
+segments outside ellipsoids, half-spaces            tangent half-spaces, local (segments.py)
+discrete barrier over a half-space or a ball        isotonic regression or small QP (barrier.py)
+limits on the rate of change                        ADMM on the differences (rate.py)
+limits on rates around ellipsoids                   interior points (rate_dynamics.py)
+linear dynamics with bounded inputs                 active set (dynamics.py), with rates interior
+                                                    points, with other parts ADMM; local
+several of these together                           Dykstra's algorithm (dykstra.py)
+anything else                                       sequential QP by ProxQP (sequential_qp.py)
 """
 
 from collections.abc import Sequence

@@ -64,7 +64,7 @@ def projector_of(part: TrajectoryConstraint) -> Projector | None:
 
 
 def projection_method(part: TrajectoryConstraint) -> str:
-    """How the nearest trajectory that satisfies the part is computed, as `cdiff check` prints it."""
+    """How a trajectory is projected onto the part, as `cdiff check` prints it."""
     if isinstance(part, LinearDynamicsConstraint):
         return "active set"
     projector = projector_of(part)

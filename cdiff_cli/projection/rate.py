@@ -26,8 +26,8 @@ class RateProjection:
     """The projection onto limits, for many calls with the same pins: each starts from the last one.
 
     parts      limits on trajectories in one frame
-    previous   per group of coupled limits that were violated: the copies of the differences and their
-               scaled multipliers, one limit after another   [k, horizon - 1, batch]
+    previous   per group of coupled limits that were violated: the copies of the differences and
+               their scaled multipliers, one limit after another   [k, horizon - 1, batch]
     """
 
     parts: Sequence[RateLimit]
@@ -59,14 +59,14 @@ class RateProjection:
 class Differences(NamedTuple):
     """The problem min |x - target|^2 s.t. limits on differences of x, per column and waypoint.
 
-    columns   coordinates that are limited                                  c of them
-    scale     environment units per unit of z                               [..., c]
-    target    in environment units                                          [c, horizon, batch]
-    column_of the column of each copy                                       [k]
-    base      target at pinned waypoints, 0 elsewhere                       [c, horizon, batch]
-    inverse   see _solver                                                   [c, horizon, horizon]
-    pushes    see _solver                                                   [k, horizon, horizon - 1]
-    weight    weight per column and waypoint in the distance                [c, horizon]
+    columns     coordinates that are limited                     c of them
+    scale       environment units per unit of z                  [..., c]
+    target      in environment units                             [c, horizon, batch]
+    column_of   the column of each copy                          [k]
+    base        target at pinned waypoints, 0 elsewhere          [c, horizon, batch]
+    inverse     see _solver                                      [c, horizon, horizon]
+    pushes      see _solver                                      [k, horizon, horizon - 1]
+    weight      weight per column and waypoint in the distance   [c, horizon]
     """
 
     columns: list[int]
@@ -167,10 +167,10 @@ def _solver(
 ) -> tuple[Tensor, Tensor]:
     """The matrices of the nearest trajectory to targets and copies together.
 
-    Per column the inverse of W + sum(rho) D^T D over the free waypoints, zero elsewhere, with the sum
-    over the limits on that column. Per copy this inverse times rho D^T. D takes differences and W holds
-    the weights of the waypoints in the distance. rho grows with the square of the horizon, as the
-    number of rounds does that a change takes from one end to the other.
+    Per column the inverse of W + sum(rho) D^T D over the free waypoints, zero elsewhere, with the
+    sum over the limits on that column. Per copy this inverse times rho D^T. D takes differences and
+    W holds the weights of the waypoints in the distance. rho grows with the square of the horizon,
+    as the number of rounds does that a change takes from one end to the other.
 
     held      whether each waypoint is pinned      per column
     weight    weight of each waypoint              per column

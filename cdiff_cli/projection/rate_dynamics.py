@@ -3,8 +3,8 @@
     minimise |x - z|^2_W   s.t.   x' = A x + B u + c,   low <= u <= high,   limits on x' - x,
                                   a.x <= b at waypoints,   pins
 
-All plans of a batch are solved at once. The dynamics express x' - x by the state and inputs of a step,
-so a limit on a rate is a convex limit at one waypoint, and all limits are solved together
+All plans of a batch are solved at once. The dynamics express x' - x by the state and inputs of a
+step, so a limit on a rate is a convex limit at one waypoint, and all limits are solved together
 (interior_point.py). Obstacles are replaced by tangent half-spaces, chosen anew at each solution
 (segments.py). Where no trajectory satisfies all limits, goals give way first.
 """

@@ -1,10 +1,11 @@
 """Trajectories whose straight segments stay outside balls and ellipsoids.
 
-A segment avoids a ball exactly when some tangent plane of the ball has both its endpoints on the outer
-side. One tangent plane is chosen per segment. The safe set then contains, waypoint by waypoint, an
-intersection of a few half-spaces, which is convex and separable. Along a part of the path that crosses
-the ball the normals turn from the entry to the exit (sphere_normals.py), so that the projected path goes
-around the ball on one side. Pushing the waypoints straight outwards would tear it.
+A segment avoids a ball exactly when some tangent plane of the ball has both its endpoints on the
+outer side. One tangent plane is chosen per segment. The safe set then contains, waypoint by
+waypoint, an intersection of a few half-spaces, which is convex and separable. Along a part of the
+path that crosses the ball the normals turn from the entry to the exit (sphere_normals.py), so that
+the projected path goes around the ball on one side. Pushing the waypoints straight outwards would
+tear it.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +36,7 @@ Plans = Bool[Tensor, "batch"]
 
 
 def excludes_ellipsoid(part: TrajectoryConstraint) -> TypeGuard[OnSegments]:
-    """Whether the part keeps segments outside an ellipsoid, so that tangent planes can replace it."""
+    """Whether the part keeps segments outside an ellipsoid, which has tangent planes."""
     return (
         isinstance(part, OnSegments)
         and isinstance(part.level, Ellipsoid)
@@ -57,8 +58,8 @@ def half_space_count(parts: Sequence[Obstacle]) -> int:
 def tangent_half_spaces(parts: Sequence[Obstacle], x: Traj, pins: Pins) -> HalfSpaces:
     """Half-spaces of each waypoint that together imply the parts, chosen at x.
 
-    A half-space part is its own. An ellipsoid gets the tangent planes of the segments before and after
-    the waypoint.
+    A half-space part is its own. An ellipsoid gets the tangent planes of the segments before and
+    after the waypoint.
     """
     batch, horizon, dim = x.shape
     m = half_space_count(parts)
@@ -172,12 +173,12 @@ def around_obstacles(
 ) -> Traj:
     """The last solutions of a problem whose obstacles are replaced by tangent half-spaces.
 
-    Half-spaces are chosen first at x for its unsafe plans, then at each solution: for the plans that
-    have half-spaces, because the set that the new ones describe contains the solution and may come
-    nearer; and once for every plan that became unsafe.
+    Half-spaces are chosen first at x for its unsafe plans, then at each solution: for the plans
+    that have half-spaces, because the set that the new ones describe contains the solution and may
+    come nearer; and once for every plan that became unsafe.
 
-    solve         (half-spaces of all plans, indices of the plans to solve) -> their trajectories, and
-                  whether to keep their half-spaces from then on
+    solve         (half-spaces of all plans, indices of the plans to solve) -> their trajectories,
+                  and whether to keep their half-spaces from then on
     x             trajectories in the coordinates of the parts
     unsafe        plans that get half-spaces before the first solution
     max_choices   how often the half-spaces of a plan are chosen
@@ -203,8 +204,8 @@ def around_obstacles(
 def project_segments(parts: Sequence[Obstacle], z: Traj, pins: Pins, max_choices: int) -> Traj:
     """The nearest trajectory in tangent half-spaces of the parts; safe plans are left unchanged.
 
-    A later choice of half-spaces never increases the distance to z, because its set contains the last
-    solution.
+    A later choice of half-spaces never increases the distance to z, because its set contains the
+    last solution.
     """
     unsafe = crossed(parts, z)
     plans = unsafe.nonzero()[:, 0]
@@ -226,11 +227,11 @@ def project_segments(parts: Sequence[Obstacle], z: Traj, pins: Pins, max_choices
 
 @dataclass(frozen=True)
 class TangentPlanes:
-    """A constraint in which half-spaces of tangent planes replace the parts that exclude ellipsoids.
+    """A constraint in which tangent half-spaces replace the parts that exclude ellipsoids.
 
     Its rows are those of the other parts, then per ellipsoid the rows of the segment before each
-    waypoint and of the segment after it. They are in the units of the parts, and -1 where there is no
-    such segment.
+    waypoint and of the segment after it. They are in the units of the parts, and -1 where there is
+    no such segment.
 
     rest          the other parts
     half_spaces   [batch, horizon, m, dim] and [batch, horizon, m], in the units of the parts

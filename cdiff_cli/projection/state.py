@@ -42,9 +42,9 @@ def _nearest_ball(ball: Ellipsoid, z: Tensor) -> Tensor:
 def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
     """min |x - z|^2 s.t. x.P x + q.x <= r, for P of any signature, by its scalar secular equation.
 
-    In the eigenbasis of P the stationary points are y(mu) = (y0 - mu q / 2) / (1 + mu lambda). f(y(mu))
-    decreases on 0 <= mu < -1 / min(lambda), and its root is the global minimiser (S-lemma). The root is
-    found by bisection in float64.
+    In the eigenbasis of P the stationary points are y(mu) = (y0 - mu q / 2) / (1 + mu lambda).
+    f(y(mu)) decreases on 0 <= mu < -1 / min(lambda), and its root is the global minimiser
+    (S-lemma). The root is found by bisection in float64.
     """
     wrong = quadric(z) > 0
     if not bool(wrong.any()):
@@ -52,7 +52,7 @@ def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
     P, q, r = _parameters_of(quadric, wrong)
     eigenvalue, basis = torch.linalg.eigh(P)
     y0, q = times(z[wrong].double(), basis), times(q, basis)
-    # Where the lowest eigenvalue is negative, bisection fails at the stationary point of f: step off.
+    # With a negative lowest eigenvalue, bisection fails at the stationary point of f: step off it.
     lowest = eigenvalue[..., 0]
     stuck = (lowest < 0) & (
         (2 * y0[:, 0] * lowest + q[..., 0]).abs() < 1e-9 * eigenvalue.abs().amax(-1)
@@ -89,7 +89,7 @@ def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
 
 
 def _parameters_of(quadric: Quadric, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """P, q, r in float64 of some states of a batch; parameters that all states share stay single."""
+    """P, q, r in float64 of some states of a batch; shared parameters stay single."""
     P, q, r = (v.double() for v in (quadric.P, quadric.q, quadric.r))
     return (
         P if P.ndim == 2 else P.expand(*which.shape, *P.shape[-2:])[which],

@@ -1,7 +1,7 @@
 """The ways in which a trajectory is projected onto a constraint, one class each.
 
-A strategy says whether it applies to a problem, and solves it. The order in which strategies are tried
-is in project.py.
+A strategy says whether it applies to a problem, and solves it. The order in which strategies are
+tried is in project.py.
 """
 
 from collections.abc import Callable, Sequence
@@ -86,7 +86,7 @@ class Problem:
 
     @cached_property
     def step_limits(self) -> list[StepLimit]:
-        """The parts besides obstacles, where all are limits on steps and one is a rate; else none."""
+        """The other parts, where all are limits on steps and one is a rate; else none."""
         limits = [part for part in self.others if limits_steps(part)]
         together = bool(self.rates) and len(limits) == len(self.others) and only_ends(self.pins)
         return limits if together else []
@@ -182,7 +182,7 @@ class OneBroken:
 
 
 class CoupledLimits:
-    """Limits on rates together with obstacles or barriers, all at once by an interior-point method."""
+    """Limits on rates together with obstacles or barriers, by an interior-point method."""
 
     def applies(self, problem: Problem) -> bool:
         return problem.coupled
@@ -194,7 +194,7 @@ class CoupledLimits:
 
 
 class TangentHalfSpaces:
-    """Segments around ellipsoids by tangent half-spaces, with all other parts by Dykstra's algorithm.
+    """Segments around ellipsoids by tangent half-spaces, with others by Dykstra's algorithm.
 
     Where Dykstra's algorithm does not satisfy g, alternating projections find a feasible point that
     is near, if not the nearest.

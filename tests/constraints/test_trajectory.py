@@ -33,7 +33,7 @@ from tests.problems import (
 seeds = st.integers(0, 10_000)
 quick = settings(max_examples=30, deadline=None)
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 
 def test_ball_outside_is_radius_minus_distance():
@@ -127,7 +127,7 @@ def test_tightening_an_inside_ball_by_more_than_its_radius_is_infeasible():
         waypoints(ball("inside", radius=0.7)).tighten(0.8)
 
 
-# gradients ------------------------------------------------------------------------------------------------------------
+# gradients ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -164,7 +164,7 @@ def test_row_sizes_bound_the_largest_eigenvalue_of_the_scaled_jacobian(kind, see
     assert float(torch.linalg.eigvalsh(scaled @ scaled.T).max()) < 2.0
 
 
-# pull-back, tighten, segments -----------------------------------------------------------------------------------------
+# pull-back, tighten, segments ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -208,7 +208,7 @@ def test_segment_max_bounds_every_point_of_the_segment_and_is_attained(name, see
 
 @quick
 @given(seed=seeds, alpha=st.floats(0.01, 1.0))
-def test_a_chain_reports_its_barrier_along_segments(seed, alpha):
+def test_segment_max_of_a_barrier_is_minus_h(seed, alpha):
     x = normal(seed, 2, 4, 2)
     assert torch.equal(
         DiscreteBarrier("c", ball("outside"), alpha).segment_max(x),
@@ -227,16 +227,16 @@ def test_to_moves_dtype_and_keeps_values():
     )
 
 
-def test_one_waypoint_has_a_segment_of_itself():
+def test_segment_max_of_a_single_waypoint_is_its_value():
     x = normal(0, 2, 1, 2)
     assert torch.equal(AtWaypoints("w", half_space()).segment_max(x), half_space()(x))
     assert torch.equal(DiscreteBarrier("c", half_space(), 0.5).segment_max(x), half_space()(x))
 
 
-# quadrics that are ellipsoids -----------------------------------------------------------------------------------------
+# quadrics that are ellipsoids ---------------------------------------------------------------------
 
 
-def test_a_quadric_knows_the_ellipsoid_whose_outside_it_is():
+def test_quadric_is_converted_to_the_ellipsoid_whose_outside_it_is():
     for level in (
         ball("outside"),
         ball("outside", centre=(0.4, -1.0, 2.0), radius=0.3, dim=5),
@@ -251,11 +251,11 @@ def test_a_quadric_knows_the_ellipsoid_whose_outside_it_is():
 
 
 @pytest.mark.parametrize("name", ["inside ball squared", "general quadric"])
-def test_other_quadrics_are_no_ellipsoids_to_stay_outside_of(name):
+def test_quadric_that_is_no_outside_of_an_ellipsoid_is_not_converted(name):
     assert LEVELS[name].ball() is None
 
 
-def test_a_quadric_that_excludes_nothing_or_leans_on_a_further_coordinate_is_no_ellipsoid():
+def test_quadric_that_excludes_nothing_or_is_a_paraboloid_is_not_converted():
     P = torch.diag(vec(-1.0, 0.0))
     assert Quadric(P, vec(0.0, 0.0), num(1.0)).ball() is None  # -x^2 <= 1 always
     assert Quadric(P, vec(0.0, 1.0), num(-1.0)).ball() is None  # y <= x^2 - 1

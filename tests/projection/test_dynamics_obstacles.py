@@ -26,7 +26,7 @@ def wall(b):
 
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, horizon=st.sampled_from([3, 20, 50]))
-def test_optimality_no_reachable_trajectory_on_the_way_to_another_is_nearer(seed, horizon):
+def test_no_other_reachable_trajectory_is_nearer(seed, horizon):
     """Of a convex problem the minimiser x has <x - z, y - x>_W >= 0 for every feasible y: here other inputs' trajectories."""
     d = maze()
     _, z = noisy_path(d, seed, 2, horizon)
@@ -41,7 +41,7 @@ def test_optimality_no_reachable_trajectory_on_the_way_to_another_is_nearer(seed
 
 
 @pytest.mark.parametrize("seed", [6, 7, 8])
-def test_a_problem_with_half_of_its_rows_active_is_solved_from_nothing(seed):
+def test_problem_with_half_of_its_rows_active_is_solved_from_a_cold_start(seed):
     """Noise that asks for six times the inputs there are, towards a wall: many rows change sides many times."""
     d = maze()
     _, z = noisy_path(d, seed, 1, 16)
@@ -53,7 +53,7 @@ def test_a_problem_with_half_of_its_rows_active_is_solved_from_nothing(seed):
     assert float((x[0] @ WALL).max()) <= 1e-8
 
 
-def test_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
+def test_changing_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
     d = maze()
     _, z = noisy_path(d, 5, 3, 16)
     z[:, 0, :2] = -0.2
@@ -64,7 +64,7 @@ def test_one_row_at_a_time_ends_at_the_same_point(monkeypatch):
     torch.testing.assert_close(x, expected, atol=1e-6, rtol=0)
 
 
-def test_a_warm_start_at_the_solution_takes_one_system_and_none_where_nothing_is_active(
+def test_warm_start_at_the_solution_solves_one_system_per_plan_with_active_rows(
     monkeypatch,
 ):
     d = maze()
@@ -84,7 +84,7 @@ def test_a_warm_start_at_the_solution_takes_one_system_and_none_where_nothing_is
     assert sum(solved) == 0
 
 
-def test_plans_that_are_safe_get_no_tangent_planes(monkeypatch):
+def test_safe_plans_get_no_tangent_half_spaces(monkeypatch):
     d, z = maze(), torch.cat((trip(), trip()))
     z[1, :, 1] += 1.0
     asked = []
@@ -99,7 +99,7 @@ def test_plans_that_are_safe_get_no_tangent_planes(monkeypatch):
     torch.testing.assert_close(x[1], z[1], atol=1e-8, rtol=0)
 
 
-def test_later_choices_of_planes_come_nearer():
+def test_later_choices_of_half_spaces_come_nearer():
     d, z = maze(), trip()
     part = OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12))
     far = [
@@ -112,7 +112,7 @@ def test_later_choices_of_planes_come_nearer():
         assert float(part(x[..., :2]).max()) <= 1e-8
 
 
-def test_rows_that_contradict_each_other_are_missed_by_both():
+def test_contradicting_rows_share_the_violation():
     """A wall that the start is 0.1 m behind: position and inputs give way, and the result is finite."""
     d = maze()
     z = trip()
@@ -123,7 +123,7 @@ def test_rows_that_contradict_each_other_are_missed_by_both():
     assert float(warm.u.abs().max()) > 1.5
 
 
-def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_solved_once_it_is_feasible(
+def test_infeasible_plan_costs_three_systems_in_the_next_call_and_is_solved_once_feasible(
     monkeypatch,
 ):
     """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
@@ -152,7 +152,7 @@ def test_what_was_found_infeasible_costs_three_systems_at_the_next_call_and_is_s
     torch.testing.assert_close(x, expected, atol=1e-8, rtol=0)
 
 
-def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give():
+def test_infeasible_rows_are_violated_by_least_squares_weighted_by_their_slack():
     """Two walls that face away from each other, a decimetre apart: the path ends in the middle between them."""
     d, z = maze(bound=1e6), torch.zeros(1, 3, 4, dtype=F64)
     z[:, 1:, 0] = 0.05
@@ -167,7 +167,7 @@ def test_rows_that_cannot_all_be_met_are_missed_by_squares_over_what_they_give()
     )  # the way there has a cost too: 1e-5
 
 
-def test_a_plan_does_not_depend_on_the_others_of_its_batch():
+def test_result_of_a_plan_does_not_depend_on_its_batch():
     d = maze()
     _, z = noisy_path(d, 9, 6, 40)
     z[:, 0, :2] -= 0.5
@@ -177,7 +177,7 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
     torch.testing.assert_close(whole, alone, atol=1e-8, rtol=0)
 
 
-def test_half_spaces_at_states_of_three_coordinates():
+def test_half_spaces_in_three_coordinates_are_satisfied():
     """Rows over used coordinates out of order and with a gap: position y and both velocities."""
     d, a = maze(), vec(0.3, 1.0, 0.2)
     _, z = noisy_path(d, 2, 2, 30)
@@ -201,7 +201,7 @@ def test_half_spaces_at_states_of_three_coordinates():
         )
 
 
-def test_what_has_no_rows_is_met_by_admm_around_the_active_set():
+def test_part_without_half_spaces_is_satisfied_by_admm():
     """A slab |y| <= 0.04 given as a projection alone is met as its half-spaces are."""
     d, z = maze(), trip()
     z[:, 0, 1] = 0.0
@@ -218,7 +218,7 @@ def test_what_has_no_rows_is_met_by_admm_around_the_active_set():
     torch.testing.assert_close(x[..., :2], expected[..., :2], atol=1e-4, rtol=0)
 
 
-def test_settling_nothing_returns_the_unconstrained_solution():
+def test_active_set_of_an_empty_batch_returns_the_unconstrained_solution():
     d = maze()
     w0 = 0.1 * normal(0, 2, 7, 6)
     numbers = tuple(tuple(v.flatten().tolist()) for v in (d.A, d.B, d.c))

@@ -21,7 +21,9 @@ from tests.projection.test_segments import outside, pushed_out, quick, random_pa
 
 @quick
 @given(seed=seeds, horizon=st.integers(1, 6), radius=st.sampled_from([0.3, 0.7]))
-def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(seed, horizon, radius):
+def test_tangent_rows_hold_only_where_the_segments_are_safe_and_have_unit_slope(
+    seed, horizon, radius
+):
     """A half-space that keeps both ends on its side keeps the segment; in metres, as f of a ball is."""
     z = normal(seed, 3, horizon, 2)
     g = segments(outside(2, radius))
@@ -41,7 +43,7 @@ def test_turned_parts_hold_only_where_the_segments_are_safe_and_are_as_steep(see
     assert bool((g(x) <= torch.maximum(before, after) + 1e-9).all())
 
 
-def test_turned_leaves_other_parts_as_they_are():
+def test_tangent_planes_leave_other_parts_unchanged():
     wall, inside = AtWaypoints("w", half_space()), AtWaypoints("i", ball("inside"))
     others, z = Constraint((wall, inside)), normal(3, 2, 5, 2)
     flat = with_tangent_planes(
@@ -58,7 +60,7 @@ def test_turned_leaves_other_parts_as_they_are():
 
 @quick
 @given(seed=seeds, horizon=st.integers(1, 6))
-def test_the_pull_of_turned_rows_is_their_gradient(seed, horizon):
+def test_pull_of_tangent_rows_is_their_gradient(seed, horizon):
     """The rows are affine, so a difference is a derivative, to rounding."""
     z = normal(seed, 2, horizon, 2)
     flat = with_tangent_planes(
@@ -74,9 +76,7 @@ def test_the_pull_of_turned_rows_is_their_gradient(seed, horizon):
 @pytest.mark.parametrize("horizon", [2, 3, 12, 40])
 @quick
 @given(seed=seeds, kind=st.sampled_from(["rough", "smooth", "straight"]), held=st.booleans())
-def test_planes_chosen_anew_beside_what_moved_are_those_chosen_anew_everywhere(
-    horizon, seed, kind, held
-):
+def test_project_segments_equals_choosing_all_half_spaces_at_each_result(horizon, seed, kind, held):
     """Two discs and a wall that hold together, so that each choice of planes leaves a feasible point."""
     g = stack(
         [

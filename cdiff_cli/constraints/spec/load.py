@@ -1,4 +1,4 @@
-"""From a YAML file of constraints to the constraint g(x) <= 0 of a task."""
+"""The constraint g(x) <= 0 of a task from a YAML file."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ from cdiff_cli.yaml_files import Document, Strict
 
 
 class Kind(Protocol):
-    """What every kind offers, ours and those of other packages."""
+    """What every kind of constraint offers, built-in ones and those of other packages."""
 
     name: str
     kind: str
@@ -191,21 +191,23 @@ def _not_observable(name: str, space: Space) -> str:
 
 
 def enforced(kinds: Sequence[Kind], g: Constraint, safety: str) -> Constraint:
-    """What sampling obeys: the parts that are to hold on segments (by their own word, else the preset's) taken so."""
-    wanted = [getattr(kind, "safety", None) or safety for kind in kinds]
-    each = [
-        part.on_segments() if want == "segments" else (part,)
-        for part, want in zip(g.parts, wanted, strict=True)
-    ]
-    return Constraint(tuple(part for parts in each for part in parts))
+    """The constraint that sampling enforces: g with some parts kept on segments.
+
+    safety   "segments" or "waypoints", for kinds whose file does not state it
+    """
+    parts: list[TrajectoryConstraint] = []
+    for kind, part in zip(kinds, g.parts, strict=True):
+        on_segments = (getattr(kind, "safety", None) or safety) == "segments"
+        parts += part.on_segments() if on_segments else (part,)
+    return Constraint(tuple(parts))
 
 
 def kinds_sha256(kinds: Sequence[Any]) -> str:
-    """Hash of the constraints as read, so that a comment in their file changes nothing."""
-    said = [kind.model_dump(mode="json", exclude_none=True) for kind in kinds]
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+    """The hash of the constraints as read, which comments in their file do not change."""
+    content = [kind.model_dump(mode="json", exclude_none=True) for kind in kinds]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of a constraint file, for editors."""
+    """The JSON schema of a constraint file, for editors."""
     return file_model().model_json_schema()

@@ -1,18 +1,19 @@
-"""Least-squares trajectories with bounds on some entries, by the active set of each plan of a batch.
+"""Least-squares trajectories with bounds on some entries, by the active set of each plan.
 
     minimise the tracking cost of w (lq_tracking.py)   s.t.   low <= slope . w <= high, row by row
 
-Each row belongs to one step. Without rows the solution w0 is one product. Few rows are active: their
-multipliers solve a small system per plan, until each active row has the right multiplier sign and no
-other row is violated. All wrong rows change at once (the primal-dual active set method: Hintermueller,
-Ito and Kunisch, 2003). Where that makes no progress, one row changes at a time, which cannot cycle
-(block principal pivoting: Judice and Pires, 1994). The result is the minimiser, up to rounding. Plans
-that are finished leave the batch.
+Each row belongs to one step. Without rows the solution w0 is one product. Few rows are active:
+their multipliers solve a small system per plan, until each active row has the right multiplier sign
+and no other row is violated. All wrong rows change at once (the primal-dual active set method:
+Hintermueller, Ito and Kunisch, 2003). Where that makes no progress, one row changes at a time,
+which cannot cycle (block principal pivoting: Judice and Pires, 1994). The result is the minimiser,
+up to rounding. Plans that are finished leave the batch.
 
-Where active rows with the right multiplier signs cannot be satisfied together, no trajectory satisfies
-all rows (Farkas), and the plan is declared infeasible. A row that it misses then costs the square of the
-slack over SLACK_INPUT or SLACK_ROW, so that a minimiser always exists. A plan that was infeasible in the
-last call gets MAX_CHANGES_AGAIN changes, until its rows can nearly be satisfied.
+Where active rows with the right multiplier signs cannot be satisfied together, no trajectory
+satisfies all rows (Farkas), and the plan is declared infeasible. A row that it misses then costs
+the square of the slack over SLACK_INPUT or SLACK_ROW, so that a minimiser always exists. A plan
+that was infeasible in the last call gets MAX_CHANGES_AGAIN changes, until its rows can nearly be
+satisfied.
 """
 
 from collections.abc import Sequence
@@ -58,16 +59,16 @@ class ActiveSetProblem(NamedTuple):
 
     The rows of a step are the bounds of its inputs, then the half-spaces of the state it leads to.
 
-    w0           unconstrained trajectories                                      [n, steps, width]
-    slope        slopes of the rows, by the entries of w that places() lists     [n, terms, steps, rows]
-    value0       values of the rows for w0                                       [n, steps, rows]
-    low, high    bounds of the rows                                              [n, steps, rows]
-    active       1 at the upper bound, -1 at the lower, else 0                   [n, steps, rows]
-    kept         multipliers of the right sign, where rows change one at a time  [n, steps, rows]
-    infeasible   plans whose rows cannot all be satisfied                        [n]
-    fewest       smallest number of wrong rows so far                            [n]
-    left         changes until rows change one at a time                         [n]
-    tries        changes until the end                                           [n]
+    w0           unconstrained trajectories                                [n, steps, width]
+    slope        slopes of the rows by the entries that places() lists     [n, terms, steps, rows]
+    value0       values of the rows for w0                                 [n, steps, rows]
+    low, high    bounds of the rows                                        [n, steps, rows]
+    active       1 at the upper bound, -1 at the lower, else 0             [n, steps, rows]
+    kept         multipliers, where rows change one at a time              [n, steps, rows]
+    infeasible   plans whose rows cannot all be satisfied                  [n]
+    fewest       smallest number of wrong rows so far                      [n]
+    left         changes until rows change one at a time                   [n]
+    tries        changes until the end                                     [n]
     """
 
     w0: Tensor
@@ -263,7 +264,7 @@ def _foremost(over: Tensor, m: int) -> Tensor:
 def _one_at_a_time(
     active: Tensor, y: Tensor, kept: Tensor, over: Tensor, enter: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The next active set of the method of Lawson and Hanson (1974) on the dual, and its multipliers.
+    """The next active set of Lawson and Hanson (1974) on the dual, and its multipliers.
 
     Where all multipliers y have the right sign, the most violated row enters. Otherwise the kept
     multipliers move towards y until the first of them reaches 0, and its row leaves.
@@ -318,12 +319,12 @@ def _at_active(track: Tracking, problem: ActiveSetProblem, bounds: Bounds) -> tu
 class ActiveRows(NamedTuple):
     """The active rows of each plan, padded to the largest number k of any plan.
 
-    position the rows, counted over the batch                         [count]
-    slot     their places in the padded arrays                        [count]
-    excess   value for w0 minus bound; 0 where padded                 [batch, k]
-    slack    slack per multiplier; 1 where padded                     [batch, k]
-    entry    entries of w that a row acts on                          [terms, batch, k]
-    slope    its slopes there                                         [terms, batch, k]
+    position   the rows, counted over the batch          [count]
+    slot       their places in the padded arrays         [count]
+    excess     value for w0 minus bound; 0 where padded  [batch, k]
+    slack      slack per multiplier; 1 where padded      [batch, k]
+    entry      entries of w that a row acts on           [terms, batch, k]
+    slope      slopes by these entries                   [terms, batch, k]
     """
 
     position: Tensor
@@ -339,15 +340,12 @@ def _active_rows(problem: ActiveSetProblem, bounds: Bounds) -> ActiveRows | None
     index = problem.active.flatten().nonzero()[:, 0]
     if not len(index):
         return None
-    (batch, terms, steps, per_step), width = problem.slope.shape, problem.w0.shape[2]
-    m, device = len(bounds.low), index.device
-    place, slack = places(steps, width, m, per_step - m, tuple(bounds.used), device)
-    rows = steps * per_step
+    batch, terms, steps, per_step = problem.slope.shape
+    rows, m = steps * per_step, len(bounds.low)
+    width, used = problem.w0.shape[2], tuple(bounds.used)
+    place, slack = places(steps, width, m, per_step - m, used, index.device)
     plan = index // rows
-    row, count = index - plan * rows, torch.bincount(plan, minlength=batch)
-    k = int(count.amax())
-    before = (count.cumsum(0) - count).index_select(0, plan)
-    slot = plan * k + torch.arange(len(index), device=device) - before
+    row, (slot, k) = index - plan * rows, _slots(plan, batch)
     first_slope = index + (terms - 1) * rows * plan
     slopes = [problem.slope.flatten().index_select(0, first_slope + i * rows) for i in range(terms)]
     numbers = torch.stack((_excess(problem, index), slack.index_select(0, row), *slopes))
@@ -355,9 +353,20 @@ def _active_rows(problem: ActiveSetProblem, bounds: Bounds) -> ActiveRows | None
     padded[1] = 1.0
     excess, slack, *_ = padded.index_copy_(1, slot, numbers).view(-1, batch, k)
     slope = padded[2:].view(terms, batch, k)
-    entry = torch.zeros(terms, batch * k, dtype=torch.long, device=device)
+    entry = torch.zeros(terms, batch * k, dtype=torch.long, device=index.device)
     entry = entry.index_copy_(1, slot, place.index_select(1, row)).view(terms, batch, k)
     return ActiveRows(index, slot, excess, slack, entry, slope)
+
+
+def _slots(plan: Tensor, batch: int) -> tuple[Tensor, int]:
+    """The places of rows in arrays [batch, k] flattened, and k, the largest number of any plan.
+
+    plan   the plan of each row, in ascending order
+    """
+    count = torch.bincount(plan, minlength=batch)
+    k = int(count.amax())
+    before = (count.cumsum(0) - count).index_select(0, plan)
+    return plan * k + torch.arange(len(plan), device=plan.device) - before, k
 
 
 def _excess(problem: ActiveSetProblem, index: Tensor) -> Tensor:

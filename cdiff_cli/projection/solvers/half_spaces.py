@@ -27,7 +27,7 @@ class HalfSpaces(NamedTuple):
 
 
 def nearest_in_half_spaces(z: Traj, half_spaces: HalfSpaces, held: Tensor) -> Traj:
-    """The nearest trajectory to z [batch, horizon, dim] with a.x <= b at every waypoint that is free.
+    """The nearest trajectory to z [batch, horizon, dim] with a.x <= b at every free waypoint.
 
     Exact with up to two active half-spaces per waypoint, which is always enough in the plane. Where
     more are active, the best point that two of them give.

@@ -40,7 +40,7 @@ def test_random_problems_agree_with_lawson_and_hanson(n, seed, shared):
 
 
 @pytest.mark.parametrize("n", [1, 7])
-def test_a_plan_is_solved_as_it_is_alone(n):
+def test_program_of_a_batch_is_solved_as_alone(n):
     A, d = normal(0, 5, n, n + 2), normal(1, 5, n)
     M = A @ A.mT
     alone = torch.cat(
