@@ -14,6 +14,7 @@ from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.load import load_constraints
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.evaluation.figures import plans as plan_figures
+from cdiff_cli.evaluation.layout import plain_table
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
@@ -45,17 +46,17 @@ def check(file: Path, picture: Path, out: Console) -> None:
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     count = "1 constraint" if len(kinds) == 1 else f"{len(kinds)} constraints, all of them at once,"
-    table = Table(title=f"{file}: {count} on {name}", title_justify="left")
-    for heading in (
-        "name",
-        "kind",
-        "meaning",
-        "rows",
-        "coordinates",
-        "projection",
-        "demonstrations that obey",
-    ):
-        table.add_column(heading, overflow="fold")
+    out.print(f"{file}: {count} on {name}", highlight=False, markup=False, style="italic")
+    meanings = Table.grid(padding=(0, 2))
+    meanings.add_column(no_wrap=True, style="bold")
+    meanings.add_column()
+    table = plain_table()
+    for heading in ("name", "kind"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("rows", justify="right")
+    table.add_column("coordinates", overflow="fold")
+    table.add_column("projection")
+    table.add_column("demonstrations", justify="right")
     for spec, part in zip(kinds, g.parts, strict=True):
         form = (
             part.example(recipe.horizon)[0] if isinstance(part, Observed) else part
@@ -64,18 +65,21 @@ def check(file: Path, picture: Path, out: Console) -> None:
         obey = (
             ""
             if demonstrations is None or form is not part
-            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%} satisfy it"
         )
+        meanings.add_row(escape(spec.name), escape(spec.describe()))
         table.add_row(
             escape(spec.name),
             spec.kind,
-            escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
             _projection(form),
             obey,
         )
-    out.print(table)
+    out.print(meanings, highlight=False)
+    out.print()
+    out.print(table, highlight=False)
+    out.print()
     fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
     if len(task.positions) != 2:
         out.print(
