@@ -117,7 +117,8 @@ def test_the_mathematics_knows_no_environment():
     [
         "cdiff_cli",
         "cdiff_cli.cli",
-        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory, cdiff_cli.commands.list_names",
+        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
+        "cdiff_cli.commands.list_names",
         "cdiff_cli.options, cdiff_cli.commands.names, cdiff_cli.commands.rerun",
         "cdiff_cli.evaluation.columns, cdiff_cli.evaluation.comparison, cdiff_cli.evaluation.statistics, cdiff_cli.evaluation.tables",
     ],
