@@ -61,7 +61,11 @@ def main(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", help="Show the version and exit.", callback=print_version, is_eager=True
+            "--version",
+            help="Show the version and exit.",
+            metavar="",
+            callback=print_version,
+            is_eager=True,
         ),
     ] = False,
 ) -> None:

@@ -15,15 +15,13 @@ TASK, CONSTRAINT, SAMPLING = "Task", "Constraint", "Sampling"
 EXECUTION, OUTPUT, STATISTICS = "Execution", "Output", "Statistics"
 
 
-def option(
-    panel: str, flags: str, text: str, metavar: str | None = None, names: Iterable[str] = ()
-) -> Any:
+def option(panel: str, flags: str, text: str, metavar: str = "", names: Iterable[str] = ()) -> Any:
     """A Typer option.
 
     panel     heading of its box in the help
     flags     as typed, "--n --episodes"
     text      the help
-    metavar   stands for the value in the help; None for a switch
+    metavar   stands for the value in the help; empty for a switch
     names     values that the shell completes
     """
     known = list(names)
@@ -206,7 +204,7 @@ AllowChanged = Annotated[
 
 # compare
 
-Folder = Annotated[Path, typer.Argument(metavar="[FOLDER]", help="a folder of runs")]
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="a folder of runs")]
 OnlyTask = Annotated[str | None, option(TASK, "--task", "runs of this task only", "NAME", TASKS)]
 Columns = Annotated[
     str | None,
@@ -287,7 +285,7 @@ Address = Annotated[
 # check and list
 
 CheckedFile = Annotated[
-    Path | None, typer.Argument(metavar="[FILE]", help="a YAML file of constraints")
+    Path | None, typer.Argument(metavar="FILE", help="a YAML file of constraints")
 ]
 Schema = Annotated[
     bool, option(OUTPUT, "--schema", "print the JSON schema of constraint files, for editors")

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from cdiff_cli.constraints.spec.load import load_constraints
 from cdiff_cli.evaluation.figures import plans as plan_figures
+from cdiff_cli.evaluation.layout import plain_table
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
@@ -41,35 +42,38 @@ def check(file: Path, picture: Path, out: Console) -> None:
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     count = "1 constraint" if len(kinds) == 1 else f"{len(kinds)} constraints, all of them at once,"
-    table = Table(title=f"{file}: {count} on {name}", title_justify="left")
-    for heading in (
-        "name",
-        "kind",
-        "meaning",
-        "rows",
-        "coordinates",
-        "projection",
-        "demonstrations that obey",
-    ):
-        table.add_column(heading, overflow="fold")
+    out.print(f"{file}: {count} on {name}", highlight=False, markup=False, style="italic")
+    meanings = Table.grid(padding=(0, 2))
+    meanings.add_column(no_wrap=True, style="bold")
+    meanings.add_column()
+    table = plain_table()
+    for heading in ("name", "kind"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("rows", justify="right")
+    table.add_column("coordinates", overflow="fold")
+    table.add_column("projection")
+    table.add_column("demonstrations", justify="right")
     forms = g.example(recipe.horizon).parts
     for spec, part, form in zip(kinds, g.parts, forms, strict=True):
         used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
         obey = (
             ""
             if demonstrations is None or form is not part
-            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%} satisfy it"
         )
+        meanings.add_row(escape(spec.name), escape(spec.describe()))
         table.add_row(
             escape(spec.name),
             spec.kind,
-            escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
             projection_method(form),
             obey,
         )
-    out.print(table)
+    out.print(meanings, highlight=False)
+    out.print()
+    out.print(table, highlight=False)
+    out.print()
     fixed = g.known()
     if len(task.positions) != 2:
         out.print(

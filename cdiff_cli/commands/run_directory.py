@@ -60,7 +60,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows with their metrics as numbers; CdiffError where the file holds no rows of runs."""
+    """Rows with their metrics as numbers; raises CdiffError where the file holds no rows."""
     try:
         with path.open(newline="") as file:
             reader = csv.DictReader(file)

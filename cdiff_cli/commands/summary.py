@@ -15,6 +15,7 @@ from cdiff_cli.evaluation.columns import (
     SAFETY_TABLE,
 )
 from cdiff_cli.evaluation.comparison import Group, compare
+from cdiff_cli.evaluation.layout import plain_table
 from cdiff_cli.evaluation.tables import render
 
 
@@ -59,15 +60,17 @@ def print_run(finished: Any, metrics: Sequence[str], as_json: bool, out: Console
 def _print_group(group: Group, metrics: Sequence[str], out: Console) -> None:
     """One line per metric: heading, mean ± standard error, definition."""
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table(title=" · ".join(group.key) + f" · n = {group.n}", title_justify="left")
+    title = f"{', '.join(dict.fromkeys(group.key))}, n = {group.n}"
+    out.print(title, style="italic", highlight=False, markup=False)
+    table = plain_table()
     table.add_column("metric", no_wrap=True)
-    table.add_column("mean ± standard error", justify="right")
+    table.add_column("mean ± standard error", justify="right", no_wrap=True)
     table.add_column("meaning", style="dim")
     for name in metrics:
         if name in group.cells:
             column = COLUMNS[name]
             value = group.cells[name].text(column.digits)
             table.add_row(column.title, value, escape(column.meaning))
-    out.print(table)
+    out.print(table, highlight=False)
+    out.print()

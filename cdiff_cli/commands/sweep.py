@@ -97,7 +97,9 @@ class Plan:
 def plan_sweep(matrix: Matrix, root: Path) -> Plan:
     """Sort the jobs of a matrix by what lies below root; raises CdiffError for an unknown name."""
     _check_names(matrix)
-    made = {path.parent.name.partition("-")[2].partition("-")[2]: path for path in find_rows(root)}
+    existing = {
+        path.parent.name.partition("-")[2].partition("-")[2]: path for path in find_rows(root)
+    }
     done: list[Outcome] = []
     todo: list[Job] = []
     refused: list[Outcome] = []
@@ -107,8 +109,8 @@ def plan_sweep(matrix: Matrix, root: Path) -> Plan:
         for job in _jobs(matrix, task, constraints, preset, method):
             if isinstance(job, Outcome):
                 refused.append(job)
-            elif job.name in made:
-                done.append(Outcome(job, 0.0, diverged=_diverged(read_rows(made[job.name]))))
+            elif job.name in existing:
+                done.append(Outcome(job, 0.0, diverged=_diverged(read_rows(existing[job.name]))))
             else:
                 todo.append(job)
     return Plan(done, todo, refused)
@@ -327,11 +329,16 @@ def progress_table(over: Sequence[Outcome], plan: Plan, began: float) -> Table:
     over    refused jobs and those made now
     began   time.monotonic() when the first run began
     """
-    made = len(over) - len(plan.refused)
-    left = len(plan.todo) - made
-    eta = f", about {(time.monotonic() - began) * left / made:.0f} s" if made and left else ""
+    completed = len(over) - len(plan.refused)
+    left = len(plan.todo) - completed
+    eta = (
+        f", about {(time.monotonic() - began) * left / completed:.0f} s"
+        if completed and left
+        else ""
+    )
     table = Table(
-        title=f"{len(plan.done)} were there, {made} made, {left} to do{eta}", title_justify="left"
+        title=f"{len(plan.done)} were there, {completed} made, {left} to do{eta}",
+        title_justify="left",
     )
     for heading in ("task", "constraints", "method", "preset"):
         table.add_column(heading)

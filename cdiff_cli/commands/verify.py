@@ -21,6 +21,7 @@ from cdiff_cli.commands.saved_run import (
 )
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.certificate import Entry, certificate, summary
+from cdiff_cli.evaluation.layout import plain_table
 from cdiff_cli.progress import progress
 
 VALUE_TOLERANCE = 1e-9  # on values, relative above 1: another processor sums in another order
@@ -89,7 +90,9 @@ def print_verified(
         reports = [run.report(waypoints_only) for run in verified]
         typer.echo(json.dumps({"runs": reports, "errors": errors}))
     elif verified:
-        out.print(table(verified, waypoints_only))
+        out.print("largest g over all plans, positive is unsafe", style="italic")
+        out.print(table(verified, waypoints_only), highlight=False)
+        out.print()
         for run in verified:
             typer.echo(run.verdict(waypoints_only))
     if errors:
@@ -215,7 +218,7 @@ def _notes(path: Path, recorded: Mapping[str, Any]) -> Iterator[str]:
 def table(verified: Sequence[Verified], waypoints_only: bool) -> Table:
     """One row per constraint: worst values over all plans, where they are, number of safe plans."""
     several = len(verified) > 1
-    shown = Table(title="largest g over all plans, positive is unsafe", title_justify="left")
+    shown = plain_table()
     headings = ("constraint", "worst waypoint", "worst segment", "executed", "exact")
     for heading in (*(("run",) if several else ()), *headings):
         shown.add_column(heading, overflow="fold")

@@ -35,6 +35,11 @@ class TextTable:
     narrow_sections: Sequence[int] = ()
 
 
+def plain_table() -> Table:
+    """A rich table with GAP between its columns and one line below the headings."""
+    return Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, GAP - 1, 0, 0))
+
+
 def markdown(table: TextTable) -> str:
     rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
     return "\n".join("| " + " | ".join(line) + " |" for line in [table.header, rule, *table.lines])
@@ -131,7 +136,7 @@ def _sections(
     for section, lines in by_section.items():
         if section:
             parts.append(Text("\n" + ", ".join(dict.fromkeys(section)), style="bold"))
-        shown = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+        shown = plain_table()
         for i in columns:
             shown.add_column(
                 table.header[i],

@@ -51,7 +51,7 @@ def test_plan_with_alm_prints_its_table_and_picture(alm_run):
     assert str(run) in stdout
 
 
-def test_a_run_holds_every_artifact_of_the_interface(alm_run):
+def test_run_directory_of_a_plan_holds_every_file(alm_run):
     run, _ = alm_run
     names = {
         "run.yaml",
@@ -79,7 +79,7 @@ def test_recommended_alm_has_zero_violation_at_waypoints_in_float64(alm_run):
         assert (plan["x"][..., 0] - plan["x"][..., 1]).max() <= 1.82
 
 
-def test_a_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
+def test_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
     run, stdout = alm_run
     proof = json.loads((run / "certificate.json").read_text())
     assert [entry["status"] for entry in proof["entries"]] == ["safe", "safe"]
@@ -92,7 +92,7 @@ def test_a_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
     assert "certificate  2 of 2 plans safe at the waypoints, 2 of 2 between them\n" in stdout
 
 
-def test_plans_begin_and_end_where_asked(alm_run):
+def test_plans_begin_at_the_start_and_end_at_the_goal(alm_run):
     run, _ = alm_run
     recipe = load_recipe("maze2d-umaze")
     with np.load(run / "plan.npz") as plan:
@@ -104,9 +104,7 @@ def test_plans_begin_and_end_where_asked(alm_run):
         )  # what the dynamics make
 
 
-def test_without_dynamics_no_inputs_are_planned_and_the_preset_is_marked_as_changed(
-    alm_run, tmp_path
-):
+def test_no_dynamics_plans_no_inputs_and_marks_the_preset_as_changed(alm_run, tmp_path):
     with np.load(alm_run[0] / "plan.npz") as plan:
         assert plan["u"].shape == (2, 127, 2)
     cdiff("plan", "--method", "alm", "--n", 1, "--no-dynamics", "--runs", tmp_path)
@@ -151,7 +149,7 @@ def test_every_method_and_preset_plans(method, preset, tmp_path):
     assert json.loads(result.stdout)["summary"][0]["violation"]["mean"] < 20
 
 
-def test_extra_steps_can_be_asked_for_and_mark_the_preset_as_changed(tmp_path):
+def test_extra_steps_option_adds_calls_and_marks_the_preset_as_changed(tmp_path):
     words = (
         "--method",
         "safediffuser",
@@ -177,7 +175,7 @@ def test_each_method_of_the_released_preset_takes_its_own_extra_steps():
 
 
 @pytest.mark.parametrize("kernel", ["ddim", "dpm++2m"])
-def test_few_steps_make_few_calls_and_still_obey(kernel, tmp_path):
+def test_few_steps_make_few_calls_and_satisfy_the_constraints(kernel, tmp_path):
     result = cdiff("plan", "--kernel", kernel, "--steps", 8, "--n", 1, "--json", "--runs", tmp_path)
     summary = json.loads(result.stdout)["summary"][0]
     assert summary["calls"]["mean"] == 8
@@ -185,7 +183,7 @@ def test_few_steps_make_few_calls_and_still_obey(kernel, tmp_path):
     assert summary["preset"] == "recommended*"
 
 
-def test_a_barrier_and_two_constraints_at_once_are_obeyed(tmp_path):
+def test_barrier_and_two_constraints_at_once_are_satisfied(tmp_path):
     for name in ("pillar", "speed"):
         file = ROOT / "constraints" / f"maze2d-umaze-{name}.yaml"
         result = cdiff(
@@ -254,7 +252,7 @@ def test_verify_certifies_a_run_of_alm(alm_run):
     )
 
 
-def test_verify_refuses_what_ignores_a_constraint_that_binds(tmp_path):
+def test_verify_does_not_certify_plans_that_ignore_an_active_constraint(tmp_path):
     slalom = ROOT / "constraints" / "maze2d-umaze-slalom.yaml"
     cdiff("plan", "--method", "diffuser", "--constraints", slalom, "--n", 4, "--runs", tmp_path)
     assert "NOT certified" in cdiff("verify", tmp_path, code=1).stdout
@@ -270,7 +268,7 @@ def test_verify_certifies_a_disc_and_a_barrier(name, tmp_path):
     )
 
 
-def test_compare_groups_runs_and_shows_the_paper(alm_run):
+def test_compare_prints_groups_and_the_papers_values(alm_run):
     run, _ = alm_run
     stdout = cdiff("compare", run.parent).stdout
     assert "alm" in stdout
@@ -280,7 +278,7 @@ def test_compare_groups_runs_and_shows_the_paper(alm_run):
     assert cdiff("compare", run.parent, "--format", "latex").stdout.startswith(r"\begin{tabular}")
 
 
-def test_check_explains_and_draws(tmp_path):
+def test_check_prints_the_meaning_and_draws_a_picture(tmp_path):
     picture = tmp_path / "c.png"
     result = cdiff("check", ROOT / "constraints" / "maze2d-large.yaml", "--picture", picture)
     for word in ("disc", "quadratic", "outside the ball", "384", "exact"):
@@ -293,7 +291,8 @@ def test_check_exports_a_json_schema():
     assert {"Linear", "Quadratic", "Dcbf"} <= set(schema["$defs"])
 
 
-GOOD = "task: maze2d-umaze\nconstraints:\n  - {name: cut, kind: linear, a: {x: 1.0, y: -1.0}, b: 1.82}\n"
+HEAD = "task: maze2d-umaze\nconstraints:\n"
+GOOD = HEAD + "  - {name: cut, kind: linear, a: {x: 1.0, y: -1.0}, b: 1.82}\n"
 BAD = {
     "unknown coordinate": (
         GOOD.replace("y: -1.0", "yy: -1.0"),
@@ -315,12 +314,12 @@ BAD = {
         "relax",
     ),
     "negative radius": (
-        "task: maze2d-umaze\nconstraints:\n  - {kind: quadratic, side: outside, centre: {x: 1, y: 0}, radius: -1}\n",
+        HEAD + "  - {kind: quadratic, side: outside, centre: {x: 1, y: 0}, radius: -1}\n",
         ":3 constraints[0].radius",
         "greater than 0",
     ),
     "alpha": (
-        "task: maze2d-umaze\nconstraints:\n  - {kind: dcbf, alpha: 1.5, barrier: {kind: linear, a: {vx: 1}, b: 4}}\n",
+        HEAD + "  - {kind: dcbf, alpha: 1.5, barrier: {kind: linear, a: {vx: 1}, b: 4}}\n",
         ":3 constraints[0].alpha",
         "less than or equal to 1",
     ),
@@ -329,7 +328,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_constraint_file_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
+def test_bad_constraint_file_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
     text, *expected = BAD[case]
     file = tmp_path / "bad.yaml"
     file.write_text(text)
@@ -378,12 +377,12 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("case", OPTIONS)
-def test_a_bad_option_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
+def test_bad_option_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
     words, expected = OPTIONS[case]
     refused("plan", *words, expected=expected, tmp_path=tmp_path)
 
 
-def test_a_checkpoint_of_another_task_is_refused(tmp_path):
+def test_checkpoint_of_another_task_is_refused(tmp_path):
     other = home() / "models" / "maze2d-large" / "small.safetensors"
     refused(
         "plan",
@@ -394,7 +393,7 @@ def test_a_checkpoint_of_another_task_is_refused(tmp_path):
     )
 
 
-def test_a_truncated_checkpoint_is_refused(tmp_path):
+def test_truncated_checkpoint_is_refused(tmp_path):
     source = home() / "models" / "maze2d-umaze"
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes((source / "small.safetensors").read_bytes()[:100_000])
@@ -432,7 +431,7 @@ def test_help_names_every_method():
     assert ", ".join(METHOD_ORDER) in shown
 
 
-def test_help_names_every_task_and_what_is_taken_where_nothing_is_said():
+def test_help_names_every_task_and_the_defaults_that_are_not_literal():
     shown = " ".join(cdiff("rollout", "--help").stdout.replace("│", " ").split())
     assert ", ".join(TASKS) in shown
     assert "YAML file of constraints [default: the task's own]" in shown

@@ -67,14 +67,14 @@ def test_every_format_holds_the_papers_value(style):
     assert expected not in text(style)
 
 
-def test_header_names_units_and_leaves_out_metrics_nobody_has():
+def test_header_names_units_and_leaves_out_metrics_without_values():
     table = text_table(GROUPS, METRICS)
     header, lines = table.header, table.lines
     assert header == [*KEYS, "n", COLUMNS["distance_paper"].title, COLUMNS["violation_paper"].title]
     assert lines[1] == ["maze2d-umaze", "corner_cut", "alm", "paper", "3", OURS, "0.2500"]
 
 
-def test_the_papers_column_stands_beside_ours_and_is_empty_where_it_is_silent():
+def test_column_of_the_paper_is_beside_ours_and_empty_where_it_has_no_value():
     table = text_table(GROUPS, METRICS, PAPER)
     header, lines = table.header, table.lines
     assert header[5:] == [
@@ -163,7 +163,7 @@ def test_latex_is_one_tabular_with_its_special_characters_escaped():
     assert shown.count(" & ") == 3 * 7
 
 
-def test_rich_moves_what_all_rows_share_into_the_title():
+def test_terminal_title_holds_the_keys_that_all_rows_share():
     shown = text("rich", title="plans")
     assert "plans · maze2d-umaze, corner_cut, paper, n = 3" in shown
     assert shown.count("maze2d-umaze") == 1
@@ -220,7 +220,7 @@ def test_terminal_leaves_out_columns_that_do_not_fit_or_puts_them_below():
     assert not any("distance" in line and "jump" in line for line in lines)
 
 
-def test_a_column_of_the_paper_stays_beside_ours():
+def test_column_of_the_paper_stays_in_the_table_of_ours():
     table = text_table(GROUPS, METRICS, PAPER)
     shown, _ = terminal(table, "", 40)
     out = io.StringIO()
@@ -234,7 +234,7 @@ def test_no_groups_make_an_empty_table(style):
     assert render([], METRICS, style) is not None
 
 
-def test_beside_the_papers_values_runs_of_one_seed_have_a_distance_too():
+def test_runs_of_one_seed_have_a_distance_beside_the_papers_values():
     """Of one plan there is no mean unconstrained one: a sweep's runs have no distance (paper)."""
     groups = compare(
         [
@@ -260,7 +260,7 @@ def test_the_shipped_paper_values_are_read():
     }
 
 
-def test_a_cell_of_fewer_values_than_rows_says_so():
+def test_cell_of_fewer_values_than_rows_shows_its_n():
     groups = compare([row(0, distance=1.0, jump=2.0), row(1, distance=3.0), row(2, distance=3.0)])
     lines = text_table(groups, ("distance", "jump")).lines
     assert lines[0][-1] == "2.0000 (n = 1)"
@@ -275,7 +275,7 @@ def test_every_format_holds_the_differences(style):
         assert ("0.03125" if style == "json" else "0.031") in table
 
 
-def test_notes_name_what_is_shown_alone():
+def test_notes_are_about_shown_metrics_and_methods_only():
     groups = compare([row(0, "guidance", "released*", violation_paper=1.0)])
     said = " ".join(notes(groups, ("violation_paper", "step_ms")))
     assert "guidance: what the released maze code calls Conditional" in said
