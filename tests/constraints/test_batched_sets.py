@@ -1,5 +1,7 @@
-"""Levels whose numbers differ by plan and by waypoint, as pull_back to windows relative to the present state makes them: they are
-what the fixed level is to each plan and waypoint alone.
+"""State sets whose parameters differ by plan and by waypoint.
+
+pull_back into a frame relative to the present state produces them. Each plan and waypoint gets the
+values that it gets alone.
 """
 
 import numpy as np
@@ -48,7 +50,9 @@ ROUNDING = 1e-9  # a few operations of float64, with 1 / scale up to 10 and 1 / 
 
 
 def frame(seed, shape, shared=False):
-    """Centre [batch | 1, horizon | 1, 2] and scale [horizon | 1, 2]; shared: one scale for both coordinates."""
+    """Centre [batch | 1, horizon | 1, 2] and scale [horizon | 1, 2]; shared: one scale for both
+    coordinates.
+    """
     scale = normal(seed + 2, shape[1], 2).abs() + 0.2
     return normal(seed + 1, *shape, 2), scale[:, :1].expand(-1, 2) if shared else scale
 
@@ -295,7 +299,9 @@ def test_barrier_over_a_half_space_with_a_scale_per_waypoint_agrees_with_proxqp(
 def test_barrier_outside_a_ball_with_a_scale_per_waypoint_agrees_with_proxqp(
     seed, alpha, n, pinned
 ):
-    """h_k = s_k (|z_k - c_k| - r_k): the nearest trajectory moves radially, and |z_k - c_k| solves a QP with bounds at 0."""
+    """h_k = s_k (|z_k - c_k| - r_k): the nearest trajectory moves radially, and |z_k - c_k| solves
+    a QP with bounds at 0.
+    """
     z = normal(seed, 2, n, 2)
     centre, scale = normal(seed + 1, 2, n, 2), (normal(seed + 2, n, 1).abs() + 0.2).expand(-1, 2)
     g = pull_back(chain(ball("outside"), alpha), centre, scale)

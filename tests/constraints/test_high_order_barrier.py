@@ -1,4 +1,4 @@
-"""Barriers of relative degree 2: high-order chains and the look-ahead; short chains, which are written out at once."""
+"""Barriers of relative degree 2: high-order barriers and the look-ahead; short horizons."""
 
 import numpy as np
 import pytest
@@ -244,7 +244,9 @@ def test_look_ahead_in_a_frame_per_waypoint_keeps_values_and_pulls(seed, shared)
 @quick
 @given(seed=seeds)
 def test_look_ahead_projection_moves_position_and_velocity_together(seed):
-    """The nearest point has the normal's direction: a KKT residual of zero at every waypoint that moved."""
+    """The nearest point has the normal's direction: a KKT residual of zero at every waypoint that
+    moved.
+    """
     scale = (normal(seed + 1, 6, 2).abs() + 0.2)[:, [0, 0, 1, 1]]
     back, z = pull_back(leading(), normal(seed + 2, 2, 6, 4), scale), normal(seed, 2, 6, 4)
     x = project(back, z, pin(z, 0))

@@ -67,7 +67,9 @@ def test_pulled_back_psi_keeps_its_values(seed):
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, time=st.floats(0.05, 1.0))
 def test_path_with_non_negative_psi_never_enters_the_ball(seed, time):
-    """dh/dt >= -h / time along a path in closed loop: radial speed -h / time, any speed across; h stays positive."""
+    """dh/dt >= -h / time along a path in closed loop: radial speed -h / time, any speed across; h
+    stays positive.
+    """
     x = normal(seed, 2)
     p, dt = (2.0 + float(x[0].abs())) * x / x.norm(), time / 500
     level = barrier(time)

@@ -1,4 +1,4 @@
-"""Constraints that observe: what YAML says of them, what they are bound to, and what each mistake is answered with."""
+"""Constraints with observed parameters: their YAML, binding, and the error for each mistake."""
 
 import pytest
 import torch

@@ -160,7 +160,8 @@ def test_row_sizes_bound_the_largest_eigenvalue_of_the_scaled_jacobian(kind, see
     J = torch.autograd.functional.jacobian(lambda v: g(v.reshape(x.shape))[0], x.flatten())
     scaled = J / size[0].clamp_min(1e-12).sqrt()[:, None]
     assert rows.shape == size.shape
-    # dual step 1 is stable below 2 / lambda_max; neighbouring rows of a chain differ in size, hence 2 rather than 1
+    # dual step 1 is stable below 2 / lambda_max; neighbouring rows of a chain differ in size,
+    # hence 2 rather than 1
     assert float(torch.linalg.eigvalsh(scaled @ scaled.T).max()) < 2.0
 
 

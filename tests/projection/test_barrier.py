@@ -1,4 +1,4 @@
-"""The nearest chain v_{k+1} >= gamma v_k: known answers, agreement with a QP solver, multipliers, powers that underflow."""
+"""The nearest values with v_{k+1} >= gamma v_k: known answers, a QP solver, multipliers, underflow."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from cdiff_cli.projection.project import project
 from cdiff_cli.projection.solvers.isotonic import pool_violators
 from tests.problems import F64, chain, nearest_chain, normal, num, pin, qp_project, vec
 
-QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; many coupled ones with alpha = 1e-3 cost digits
+QP = 1e-6  # accuracy of ProxQP: 1e-9 per constraint, less for many coupled ones
 
 
 def _fixed(n, *ends):
@@ -92,7 +92,9 @@ def test_weighted_nearest_barrier_values_agree_with_proxqp(seed, n, alpha, ends)
 @pytest.mark.parametrize("n", [384, 1536])
 @pytest.mark.parametrize("start", ["free", "start fixed"])
 def test_nearest_values_of_long_barriers_are_optimal_and_idempotent(n, alpha, start):
-    """Stationarity  w_k (v_k - h_k) + gamma lam_k - lam_{k-1} = 0,  lam >= 0 only where v_{k+1} = gamma v_k."""
+    """Stationarity  w_k (v_k - h_k) + gamma lam_k - lam_{k-1} = 0,  lam >= 0 only where v_{k+1} =
+    gamma v_k.
+    """
     gamma, w, fixed = (
         1 - alpha,
         normal(n, n).abs() + 0.2,
@@ -116,7 +118,9 @@ def test_nearest_values_of_long_barriers_are_optimal_and_idempotent(n, alpha, st
 
 
 def _pooled_one_by_one(h, gamma, w):
-    """The stack of pooled adjacent violators, one index after the other: (N, D, length) of each block."""
+    """The stack of pooled adjacent violators, one index after the other: (N, D, length) of each
+    block.
+    """
     blocks = []
     for value, weight in zip(h.tolist(), w.tolist(), strict=True):
         blocks.append((weight * value, weight, 1))
@@ -177,8 +181,9 @@ def test_merging_in_windows_equals_merging_one_by_one(kinds, seed, n, alpha, spr
 
 
 def test_block_with_a_large_weight_takes_in_no_neighbour_that_does_not_fall():
-    """With the first 60 values in one block, what follows changes the value pooled with it by less than rounding: a test on that
-    value could not tell that the block stays out.
+    """The first 60 values are one block, whose weight hides what is pooled with it.
+
+    The pooled value changes by less than rounding, so the test looks at the block itself.
     """
     h = torch.linspace(0, 1, 120, dtype=F64).repeat(8, 1)
     h[:, :60] = -torch.linspace(1, 3, 8, dtype=F64)[:, None]

@@ -1,4 +1,6 @@
-"""Linear dynamics: fitting them, their rows by hand, and the nearest reachable trajectory against a QP solver."""
+"""Linear dynamics: fitting them, their rows by hand, and the nearest reachable trajectory against a
+QP solver.
+"""
 
 from dataclasses import replace
 
@@ -66,7 +68,9 @@ def reachable(dynamics, tolerance=1e-5, weight=None):
 
 
 def noisy_path(dynamics, seed, batch, horizon, noise=0.02):
-    """A trajectory under random inputs and, beside it, itself with noise on all states but the first."""
+    """A trajectory under random inputs and, beside it, itself with noise on all states but the
+    first.
+    """
     u = torch.clamp(normal(seed, batch, horizon - 1, 2, scale=0.8), -1, 1)
     path = dynamics.rollout(normal(seed + 1, batch, 4) * vec(0.5, 0.5, 2, 2), u)
     z = path + noise * normal(seed + 2, batch, horizon, 4) * vec(1, 1, 15, 15)
@@ -89,7 +93,9 @@ def distance(x, z):
 
 
 def qp(dynamics, z, pinned, a=None, b=0.0):
-    """The same by ProxQP over all states and inputs at once: a.x <= b at every waypoint that is not pinned."""
+    """The same by ProxQP over all states and inputs at once: a.x <= b at every waypoint that is not
+    pinned.
+    """
     (H, n), m = z.shape, dynamics.B.shape[1]
     N, M = H * n, (H - 1) * m
     w = np.tile(WEIGHT.numpy(), H)
@@ -152,7 +158,9 @@ def test_inputs_of_a_path_are_those_that_made_it_and_are_cut_to_their_bounds():
 
 
 def test_residual_by_hand():
-    """u = -3 is cut to -1: the step misses by 2 (1/2, 1). A step sideways to B = (1/2, 1) is missed whole."""
+    """u = -3 is cut to -1: the step misses by 2 (1/2, 1). A step sideways to B = (1/2, 1) is missed
+    whole.
+    """
     d = double_integrator()
     x = d.rollout(vec(0.0, 1.0)[None], torch.tensor([[[0.5], [-3.0]]], dtype=F64))
     torch.testing.assert_close(d.residual(x), vec(0.0, 2 * 1.25**0.5)[None], atol=1e-12, rtol=0)
@@ -248,7 +256,9 @@ def test_a_coordinate_that_never_moves_is_fitted():
 @pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("horizon", [2, 8, 24])
 def test_projection_without_bounds_is_the_least_squares_solution(horizon, ends):
-    """x = F x0 + G u with the first state given: min |W^(1/2) (G u - r)|^2, s.t. the last state where pinned, by its KKT system."""
+    """x = F x0 + G u with the first state given: min |W^(1/2) (G u - r)|^2, s.t. the last state
+    where pinned, by its KKT system.
+    """
     d = replace(maze(bound=1e6), c=vec(0.01, 0.0, 0.02, -0.01))
     path, z = noisy_path(d, horizon, 1, horizon)
     ends = ends and horizon > 2  # one step reaches no state of four coordinates exactly
@@ -351,7 +361,9 @@ def test_short_horizons_and_empty_batches_are_returned(batch, horizon):
 
 
 def trip(horizon=64, length=0.8):
-    """A reachable trip along y = .05 at constant acceleration, then deceleration, from rest to rest."""
+    """A reachable trip along y = .05 at constant acceleration, then deceleration, from rest to
+    rest.
+    """
     half = (horizon - 1) // 2
     u = torch.zeros(1, horizon - 1, 2, dtype=F64)
     u[0, :half, 0], u[0, half : 2 * half, 0] = 1.0, -1.0
@@ -459,7 +471,9 @@ def test_barrier_disc_and_wall_are_satisfied_with_dynamics():
 
 
 def test_speed_limit_and_disc_are_satisfied_with_dynamics():
-    """The limit has no half-spaces at waypoints: its own projection (rate.py) takes turns with the active set."""
+    """The limit has no half-spaces at waypoints: its own projection (rate.py) takes turns with the
+    active set.
+    """
     z = trip()
     one = torch.ones(4, dtype=F64)
     slow = RateLimit(

@@ -1,4 +1,6 @@
-"""The active set of the projection with dynamics: optimality by its own conditions, hard and infeasible problems, warm starts."""
+"""The active set of the projection with dynamics: optimality by its own conditions, hard and
+infeasible problems, warm starts.
+"""
 
 import pytest
 import torch
@@ -27,7 +29,9 @@ def wall(b):
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, horizon=st.sampled_from([3, 20, 50]))
 def test_no_other_reachable_trajectory_is_nearer(seed, horizon):
-    """Of a convex problem the minimiser x has <x - z, y - x>_W >= 0 for every feasible y: here other inputs' trajectories."""
+    """Of a convex problem the minimiser x has <x - z, y - x>_W >= 0 for every feasible y: here
+    other inputs' trajectories.
+    """
     d = maze()
     _, z = noisy_path(d, seed, 2, horizon)
     x, warm = solve(d, z, pin(z, 0))
@@ -42,7 +46,9 @@ def test_no_other_reachable_trajectory_is_nearer(seed, horizon):
 
 @pytest.mark.parametrize("seed", [6, 7, 8])
 def test_problem_with_half_of_its_rows_active_is_solved_from_a_cold_start(seed):
-    """Noise that asks for six times the inputs there are, towards a wall: many rows change sides many times."""
+    """Noise that asks for six times the inputs there are, towards a wall: many rows change sides
+    many times.
+    """
     d = maze()
     _, z = noisy_path(d, seed, 1, 16)
     z[:, 0, :2] = -0.05
@@ -113,7 +119,9 @@ def test_later_choices_of_half_spaces_come_nearer():
 
 
 def test_contradicting_rows_share_the_violation():
-    """A wall that the start is 0.1 m behind: position and inputs give way, and the result is finite."""
+    """A wall that the start is 0.1 m behind: position and inputs give way, and the result is
+    finite.
+    """
     d = maze()
     z = trip()
     z[:, 0] = vec(0.1, 0.0, 1.0, 0.0)
@@ -126,7 +134,9 @@ def test_contradicting_rows_share_the_violation():
 def test_infeasible_plan_costs_three_systems_in_the_next_call_and_is_solved_once_feasible(
     monkeypatch,
 ):
-    """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far from the way."""
+    """A disc that three tenths of the inputs do not get past, a millimetre further on; then one far
+    from the way.
+    """
     d = maze(bound=0.3)
     z = trip()
     near, far = (
@@ -146,14 +156,18 @@ def test_infeasible_plan_costs_three_systems_in_the_next_call_and_is_solved_once
     expected, _ = solve(maze(), z, pin(z, 0, 63), [far])
     for _ in range(
         4
-    ):  # rows that pull where nothing is in the way any more leave all at once, then the inputs settle
+        # rows that pull where nothing is in the way any more leave all at once, then the inputs
+        # settle
+    ):
         x, warm = solve(maze(), z, pin(z, 0, 63), [far], warm=warm)
     assert warm.infeasible.tolist() == [False]
     torch.testing.assert_close(x, expected, atol=1e-8, rtol=0)
 
 
 def test_infeasible_rows_are_violated_by_least_squares_weighted_by_their_slack():
-    """Two walls that face away from each other, a decimetre apart: the path ends in the middle between them."""
+    """Two walls that face away from each other, a decimetre apart: the path ends in the middle
+    between them.
+    """
     d, z = maze(bound=1e6), torch.zeros(1, 3, 4, dtype=F64)
     z[:, 1:, 0] = 0.05
     walls = [

@@ -1,4 +1,6 @@
-"""Projection where no closed form serves: intersections, opaque rows, sequential linearisation, and what is refused."""
+"""Projection where no closed form serves: intersections, opaque rows, sequential linearisation, and
+what is refused.
+"""
 
 import pytest
 import torch

@@ -228,7 +228,9 @@ def test_half_space_agrees_with_proxqp(seed):
 @quick
 @given(seed=seeds, n=st.integers(2, 4))
 def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
-    """b > 0 keeps the origin feasible; normals stand 0.9 rad apart or more: Dykstra is slow between nearly parallel walls."""
+    """b > 0 keeps the origin feasible; normals stand 0.9 rad apart or more: Dykstra is slow between
+    nearly parallel walls.
+    """
     z = normal(seed, 1, 3, 2)
     turn = 2.4 * torch.arange(n) + float(normal(seed + 1, 1))
     g = stack(
@@ -298,7 +300,9 @@ def test_half_space_moves_only_the_free_coordinate_of_a_pinned_state():
 
 
 def _boundary(level, reach=6.0, n=1201):
-    """Points of {f = 0}: the zeros of f along the lines of a fine grid, each interpolated then polished by Newton steps."""
+    """Points of {f = 0}: the zeros of f along the lines of a fine grid, each interpolated then
+    polished by Newton steps.
+    """
     line = torch.linspace(-reach, reach, n, dtype=F64)
     grid = torch.stack(torch.meshgrid(line, line, indexing="ij"), -1)
     f = level(grid)
@@ -357,7 +361,8 @@ def test_barrier_outside_a_ball_is_optimal_against_brute_force(alpha, seed):
     g = chain(level, alpha)
     x = free_projection(g, z)
     assert float(g(x).max()) <= 1e-12
-    # only radii matter: each waypoint moves along its own ray, so three radii are searched on a grid
+    # only radii matter: each waypoint moves along its own ray, so three radii are searched on a
+    # grid
     r = torch.linspace(0, 3, 151, dtype=F64)
     a, b, c = torch.meshgrid(r, r, r, indexing="ij")
     length = z.norm(dim=-1)[0]

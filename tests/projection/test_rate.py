@@ -1,4 +1,6 @@
-"""`kind: rate`: known answers, gradients, the projection against ProxQP and its KKT conditions, files, certificates, commands."""
+"""`kind: rate`: known answers, gradients, the projection against ProxQP and its KKT conditions,
+files, certificates, commands.
+"""
 
 import json
 
@@ -176,7 +178,9 @@ def test_limits_on_one_coordinate_agree_with_proxqp(held, bounds):
 @quick
 @given(seed=seeds, horizon=st.sampled_from([2, 3, 12, 60]), scale=st.sampled_from([0.02, 0.1, 1.0]))
 def test_projection_onto_a_length_limit_satisfies_the_kkt_conditions(seed, horizon, scale):
-    """x - z = D^T m, each m along its difference, not against it, and nothing where the limit is not reached."""
+    """x - z = D^T m, each m along its difference, not against it, and nothing where the limit is
+    not reached.
+    """
     part, z = LIMITS["length"], scale * normal(seed, 3, horizon, 2)
     x = free_projection(only(part), z)
     assert float(part(x).max()) <= CLOSE[F64]

@@ -1,4 +1,6 @@
-"""Limits on several rates together: where they share coordinates, where they contradict each other, beside dynamics."""
+"""Limits on several rates together: where they share coordinates, where they contradict each other,
+beside dynamics.
+"""
 
 import json
 

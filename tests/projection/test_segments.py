@@ -46,7 +46,9 @@ def one(*points):
 
 
 def random_path(kind, seed, batch, horizon, k):
-    """Rough: independent points. Smooth: a random walk around the origin. Straight: through its neighbourhood, evenly."""
+    """Rough: independent points. Smooth: a random walk around the origin. Straight: through its
+    neighbourhood, evenly.
+    """
     if kind == "rough":
         return normal(seed, batch, horizon, k)
     if kind == "smooth":
@@ -343,7 +345,9 @@ def test_single_waypoint_has_no_segment():
 @quick
 @given(seed=seeds, m=st.integers(1, 5))
 def test_the_nearest_point_in_half_planes_is_the_least_distance_and_has_multipliers(seed, m):
-    """b >= 0.2 keeps the origin feasible. Stationarity: z - x is a non-negative sum of the active normals."""
+    """b >= 0.2 keeps the origin feasible. Stationarity: z - x is a non-negative sum of the active
+    normals.
+    """
     a, b, z = (
         normal(seed, 2, 4, m, 2),
         normal(seed + 1, 2, 4, m).abs() + 0.2,
@@ -380,7 +384,9 @@ def test_pinned_waypoints_ignore_half_spaces():
 
 
 def slsqp(level, z, restarts=8):
-    """The least distance of a segment-safe path from z [horizon, k] that SLSQP finds from random beginnings."""
+    """The least distance of a segment-safe path from z [horizon, k] that SLSQP finds from random
+    beginnings.
+    """
     part, target, rng, best = OnSegments("s", level), z.numpy(), np.random.default_rng(0), math.inf
     shape, each = (1, *z.shape), torch.eye(len(z) - 1, dtype=F64)
 
@@ -406,7 +412,9 @@ def slsqp(level, z, restarts=8):
 
 
 def test_distance_is_near_the_best_of_many_restarts_on_small_problems():
-    """Straight paths of 4 to 8 waypoints through a disc: measured 1.00 to 1.17 times the best, 1.05 in the middle."""
+    """Straight paths of 4 to 8 waypoints through a disc: measured 1.00 to 1.17 times the best, 1.05
+    in the middle.
+    """
     ratios = []
     for seed in range(12):
         horizon, level = (4, 6, 8)[seed % 3], outside(2, (0.5, 0.8)[seed % 2])

@@ -1,4 +1,6 @@
-"""Rows of tangent planes in the place of parts that go round balls, and planes chosen anew beside what moved."""
+"""Rows of tangent planes in the place of parts that go round balls, and planes chosen anew beside
+what moved.
+"""
 
 import pytest
 import torch
@@ -24,7 +26,9 @@ from tests.projection.test_segments import outside, pushed_out, quick, random_pa
 def test_tangent_rows_hold_only_where_the_segments_are_safe_and_have_unit_slope(
     seed, horizon, radius
 ):
-    """A half-space that keeps both ends on its side keeps the segment; in metres, as f of a ball is."""
+    """A half-space that keeps both ends on its side keeps the segment; in metres, as f of a ball
+    is.
+    """
     z = normal(seed, 3, horizon, 2)
     g = segments(outside(2, radius))
     flat = with_tangent_planes(g, z, Pins.none(z))
@@ -77,7 +81,9 @@ def test_pull_of_tangent_rows_is_their_gradient(seed, horizon):
 @quick
 @given(seed=seeds, kind=st.sampled_from(["rough", "smooth", "straight"]), held=st.booleans())
 def test_project_segments_equals_choosing_all_half_spaces_at_each_result(horizon, seed, kind, held):
-    """Two discs and a wall that hold together, so that each choice of planes leaves a feasible point."""
+    """Two discs and a wall that hold together, so that each choice of planes leaves a feasible
+    point.
+    """
     g = stack(
         [
             segments(outside(2, 0.4)),

@@ -1,4 +1,6 @@
-"""`kind: dynamics` and `safety:` in a constraint file: what they compile to, mistakes, records, `cdiff check`, `cdiff verify`."""
+"""`kind: dynamics` and `safety:` in a constraint file: what they compile to, mistakes, records,
+`cdiff check`, `cdiff verify`.
+"""
 
 import dataclasses
 
@@ -57,7 +59,9 @@ def load(folder, *entries, dynamics=None):
 
 
 def test_given_dynamics_by_hand(tmp_path):
-    """From (0, 0, 2, 4) with inputs (1, 0.5): x = 1, y = 2, vx = 3, vy = 4 + 1 - .25; up = -1 is beyond its bound 0, by 2 in vy."""
+    """From (0, 0, 2, 4) with inputs (1, 0.5): x = 1, y = 2, vx = 3, vy = 4 + 1 - .25; up = -1 is
+    beyond its bound 0, by 2 in vy.
+    """
     (kind,), g = load(tmp_path, GIVEN)
     x = torch.tensor([[[0, 0, 2, 4], [1, 2, 3, 4.75], [2.5, 4.375, 3, 2.5]]], dtype=torch.float64)
     torch.testing.assert_close(

@@ -1,4 +1,6 @@
-"""The interior-point method: its cones, its linear-quadratic steps, its results against ProxQP and ADMM."""
+"""The interior-point method: its cones, its linear-quadratic steps, its results against ProxQP and
+ADMM.
+"""
 
 import numpy as np
 import pytest

@@ -102,7 +102,9 @@ def test_products_between_rows_equal_the_dense_matrix_and_are_symmetric(ends):
 
 
 def test_coordinate_that_no_input_moves_follows_the_dynamics():
-    """The third coordinate halves at each step; its pinned end elsewhere is missed, the other two are met."""
+    """The third coordinate halves at each step; its pinned end elsewhere is missed, the other two
+    are met.
+    """
     A = torch.diag(torch.tensor([1.0, 1.0, 0.5], dtype=F64))
     B = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], dtype=F64)
     z = normal(0, 1, 5, 3)

@@ -1,4 +1,6 @@
-"""Principal pivoting of a batch of small programs: known answers, the optimality conditions, and a solver's own."""
+"""Principal pivoting of a batch of small programs: known answers, the optimality conditions, and a
+solver's own.
+"""
 
 import pytest
 import torch
@@ -13,7 +15,9 @@ NONE = torch.zeros(1, 1, dtype=F64)
 
 
 def test_known_answers():
-    """Alone each row takes lam = d / M; of two rows that press on each other, the one that asks for more."""
+    """Alone each row takes lam = d / M; of two rows that press on each other, the one that asks for
+    more.
+    """
     assert nonnegative_least(torch.diag(vec(2.0, 4.0)), vec(1.0, -1.0)[None], NONE).tolist() == [
         [0.5, 0.0]
     ]
