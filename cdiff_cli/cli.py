@@ -14,10 +14,10 @@ import typer
 from rich.console import Console
 
 from cdiff_cli import __version__
-from cdiff_cli import options as o
+from cdiff_cli.commands import options as o
 from cdiff_cli.commands.names import check_names, check_sweep, check_train
+from cdiff_cli.commands.options import RUNS
 from cdiff_cli.errors import CdiffError
-from cdiff_cli.options import RUNS
 from cdiff_cli.progress import err, progress
 
 app = typer.Typer(

@@ -21,7 +21,6 @@ LAYERS = [
     {"planning", "training"},
     {"evaluation"},
     {"commands", "api"},
-    {"options"},
     {"cli"},
 ]
 """A folder or file imports from lower layers only; those of one layer do not import each other."""
@@ -124,7 +123,7 @@ def test_the_mathematics_knows_no_environment():
         "cdiff_cli.yaml_files, cdiff_cli.paths, cdiff_cli.machine",
         "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
         "cdiff_cli.commands.list_names",
-        "cdiff_cli.options, cdiff_cli.commands.names, cdiff_cli.commands.rerun",
+        "cdiff_cli.commands.options, cdiff_cli.commands.names, cdiff_cli.commands.rerun",
         "cdiff_cli.evaluation.columns, cdiff_cli.evaluation.comparison, cdiff_cli.evaluation.statistics, cdiff_cli.evaluation.tables",
     ],
 )
