@@ -51,7 +51,9 @@ def main() -> None:
     arguments = parser.parse_args()
     file = arguments.constraints or "default constraints"
     print(f"{arguments.task}, {file}, batch {arguments.n}, median of {arguments.repeats}")
-    print(f"{'preset':12} {'method':16} {'network / ms':>14} {'outside / ms':>14} {'share / %':>10}")
+    print(
+        f"{'preset':12} {'method':16} {'network / ms':>14} {'outside / ms':>14} {'share / %':>10}"
+    )
     for preset in arguments.presets.split(","):
         for method in arguments.methods.split(","):
             request = Request(

@@ -15,7 +15,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.planning.open_loop import plan
@@ -51,7 +52,7 @@ for task in arguments.tasks.split(","):
         for with_dynamics in (False, True):
             for batch in map(int, arguments.batches.split(",")):
                 file = CONSTRAINTS / f"{task}-disc.yaml"
-                resolved = resolve(
+                experiment = resolve(
                     Request(
                         task=task,
                         preset=preset,
@@ -61,7 +62,7 @@ for task in arguments.tasks.split(","):
                         random=True,
                     )
                 )
-                problem = resolved.problem
+                problem = experiment.problem
                 if not with_dynamics:
                     kept = tuple(
                         part
@@ -71,14 +72,8 @@ for task in arguments.tasks.split(","):
                     problem = replace(problem, enforced=Constraint(kept))
                 measured = []
                 for repeat in range(arguments.repeats + 1):
-                    seeds = [seed + 1000 * repeat for seed in resolved.seeds]
-                    plans = plan(
-                        problem,
-                        resolved.method,
-                        seeds,
-                        kernel=resolved.kernel,
-                        polish=resolved.preset.polish,
-                    )
+                    seeds = [seed + 1000 * repeat for seed in experiment.seeds]
+                    plans = plan(problem, experiment.method, seeds, experiment.preset.sampler)
                     measured.append(
                         (
                             1e3 * plans.total_s,

@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from timing import milliseconds
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import split
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import pull_back
@@ -25,11 +26,11 @@ CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 
 def measure(task: str, batch: int, repeats: int) -> list[str]:
     """The cells of one line of the table."""
-    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
-    problem, checkpoint = resolved.problem, resolved.checkpoint
+    experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    problem, checkpoint = experiment.problem, experiment.checkpoint
     assert checkpoint is not None
     windows = checkpoint.demonstrations.double()
-    inside = problem.g(windows) > 0
+    inside = problem.declared(windows) > 0
     crossing = windows[
         inside.any(1) & ~inside[:, [0, -1]].any(1)
     ]  # those that enter the disc on their way, over and over
@@ -40,10 +41,10 @@ def measure(task: str, batch: int, repeats: int) -> list[str]:
     pins = Pins(mask, z)
     back = (problem.normaliser.centre, problem.normaliser.scale)
     waypoints, segments = (
-        pull_back(g, *back).to(z) for g in (problem.g, split(problem.enforced)[0])
+        pull_back(g, *back).to(z) for g in (problem.declared, split(problem.enforced)[0])
     )
     with torch.inference_mode():
-        network = milliseconds(lambda: problem.denoiser(z, 10), repeats)
+        network = milliseconds(lambda: problem.planner.denoiser(z, 10), repeats)
         parts = [
             milliseconds(lambda: project(waypoints, z, pins, strict=False), repeats),
             milliseconds(lambda: project(segments, z, pins, strict=False), repeats),

@@ -1,6 +1,6 @@
 """The projection with dynamics against other solvers, and what it costs by horizon and by batch. One run.
 
-    python tests/benchmarks/projection/dynamics.py [--batches 1,10,100] [--repeats 5] [--threads 2] [--plot docs/cost.png]
+    python tests/benchmarks/speed/reaching.py [--batches 1,10,100] [--repeats 5] [--threads 2] [--plot docs/cost.png]
 
 Solvers: demonstrations that cross the mazes' discs, start and goal pinned, tangent planes as chosen at the demonstration. Ours (the
 planes' choice included) ends at the minimiser; ProxQP (qpsolvers, sparse, one plan after another) and a dense batched Mehrotra
@@ -22,7 +22,8 @@ from rich.table import Table
 from scipy import sparse
 from timing import milliseconds
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import LinearDynamics, dynamics_of, split
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.segments import OnSegments
@@ -175,10 +176,10 @@ class Condensed:
 
 def crossing(task):
     """Dynamics, parts, weight, demonstrations around the disc that the dynamics make, and the task's denoiser."""
-    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
-    problem = resolved.problem
-    windows = resolved.checkpoint.demonstrations.double()
-    inside = problem.g(windows) > 0
+    experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    problem = experiment.problem
+    windows = experiment.checkpoint.demonstrations.double()
+    inside = problem.declared(windows) > 0
     windows = windows[inside.any(1) & ~inside[:, [0, -1]].any(1)]
     reachable = dynamics_of(problem.enforced)[0]
     windows = windows[(reachable(windows) <= 1e-4).all(1)]
@@ -245,7 +246,7 @@ def against_solvers(batches, repeats):
                 milliseconds(partial(ours, d, parts, weight, z + bump, pins, state), repeats)
                 / batch
             )
-            network = milliseconds(partial(problem.denoiser, normal, 10), 3) / batch
+            network = milliseconds(partial(problem.planner.denoiser, normal, 10), 3) / batch
             costs[horizon, batch] = (batch * mine, batch * again, batch * network)
             cells = [
                 f"{network:.2f}",

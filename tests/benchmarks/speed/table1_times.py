@@ -11,12 +11,12 @@ the last sixteenth of them, `recommended*` (--no-dynamics) in none. The projecti
 import argparse
 import itertools
 import statistics
-from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from cdiff_cli.commands.resolve import Experiment, Request, resolve
+from cdiff_cli.commands.experiment import Experiment, Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.evaluation import tables
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
@@ -61,8 +61,8 @@ def asked(arguments: argparse.Namespace) -> dict[Key, Experiment]:
 
 def step_ms(one: Experiment) -> tuple[float, float]:
     """Milliseconds of a diffusion step and, of these, in the network."""
-    problem = replace(one.problem, denoiser=one.guided or one.problem.denoiser)
-    plans = plan(problem, one.method, one.seeds, kernel=one.kernel)
+    sampler = one.preset.sampler.model_copy(update={"extra_steps": 0, "polish": False})
+    plans = plan(one.constrained, one.method, one.seeds, sampler)
     return 1e3 * plans.total_s / plans.calls, 1e3 * plans.network_s / plans.calls
 
 

@@ -15,9 +15,11 @@ import math
 import numpy as np
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.planning.open_loop import plan
 from cdiff_cli.sampling import load_kernel
@@ -112,15 +114,12 @@ def exact_scores(n_steps):
 
 def trained_model(task, n):
     def plans(kernel, steps):
-        resolved = resolve(
+        one = resolve(
             Request(task=task, method="diffuser", n=n, random=True, kernel=kernel, steps=steps)
         )
-        columns = [
-            resolved.problem.task.layout.index(name) for name in resolved.problem.task.positions
-        ]
-        return plan(resolved.problem, resolved.method, resolved.seeds, kernel=kernel).x[
-            ..., columns
-        ]
+        sampler = SamplerSettings(kernel=kernel)
+        x = plan(one.problem, one.method, one.seeds, sampler).x
+        return x[..., one.planner.position_columns]
 
     truth = plans("dpm++2m", None)
     for kernel in DETERMINISTIC:
