@@ -52,7 +52,7 @@ for task in arguments.tasks.split(","):
         for with_dynamics in (False, True):
             for batch in map(int, arguments.batches.split(",")):
                 file = CONSTRAINTS / f"{task}-disc.yaml"
-                resolved = resolve(
+                experiment = resolve(
                     Request(
                         task=task,
                         preset=preset,
@@ -62,7 +62,7 @@ for task in arguments.tasks.split(","):
                         random=True,
                     )
                 )
-                problem = resolved.problem
+                problem = experiment.problem
                 if not with_dynamics:
                     kept = tuple(
                         part
@@ -72,13 +72,8 @@ for task in arguments.tasks.split(","):
                     problem = replace(problem, enforced=Constraint(kept))
                 measured = []
                 for repeat in range(arguments.repeats + 1):
-                    seeds = [seed + 1000 * repeat for seed in resolved.seeds]
-                    plans = plan(
-                        problem,
-                        resolved.method,
-                        seeds,
-                        resolved.preset.sampler,
-                    )
+                    seeds = [seed + 1000 * repeat for seed in experiment.seeds]
+                    plans = plan(problem, experiment.method, seeds, experiment.preset.sampler)
                     measured.append(
                         (
                             1e3 * plans.total_s,

@@ -26,8 +26,8 @@ CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 
 def measure(task: str, batch: int, repeats: int) -> list[str]:
     """The cells of one line of the table."""
-    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
-    problem, checkpoint = resolved.problem, resolved.checkpoint
+    experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    problem, checkpoint = experiment.problem, experiment.checkpoint
     assert checkpoint is not None
     windows = checkpoint.demonstrations.double()
     inside = problem.declared(windows) > 0

@@ -1,6 +1,6 @@
 """The projection with dynamics against other solvers, and what it costs by horizon and by batch. One run.
 
-    python tests/benchmarks/projection/dynamics.py [--batches 1,10,100] [--repeats 5] [--threads 2] [--plot docs/cost.png]
+    python tests/benchmarks/speed/reaching.py [--batches 1,10,100] [--repeats 5] [--threads 2] [--plot docs/cost.png]
 
 Solvers: demonstrations that cross the mazes' discs, start and goal pinned, tangent planes as chosen at the demonstration. Ours (the
 planes' choice included) ends at the minimiser; ProxQP (qpsolvers, sparse, one plan after another) and a dense batched Mehrotra
@@ -29,8 +29,7 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import Ellipsoid
 from cdiff_cli.projection.dynamics import project_dynamics
-from cdiff_cli.projection.segments import tangent_half_spaces
-from cdiff_cli.projection.solvers.half_spaces import NEVER
+from cdiff_cli.projection.segments import NEVER, planes
 
 CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 USED = (0, 1)
@@ -39,13 +38,13 @@ FAR = 1e3  # bound of a half-space that is not there, for solvers that want a nu
 
 def ours(d, parts, weight, z, pins, warm=None):
     return project_dynamics(
-        d, parts, None, z, pins, columns=USED, weight=weight, rounds=1, warm=warm, tolerance=1e-6
+        d, parts, None, z, pins, used=USED, weight=weight, rounds=1, warm=warm, tolerance=1e-6
     )
 
 
 def halfspaces(parts, z, mask):
     """As ours takes them at z, of the waypoints 1 .. horizon - 2."""
-    a, b = tangent_half_spaces(parts, z[..., USED], Pins(mask[:, USED], z[..., USED]))
+    a, b = planes(parts, z[..., USED], Pins(mask[:, USED], z[..., USED]))
     return a[:, 1:-1], b[:, 1:-1]
 
 
@@ -177,9 +176,9 @@ class Condensed:
 
 def crossing(task):
     """Dynamics, parts, weight, demonstrations around the disc that the dynamics make, and the task's denoiser."""
-    resolved = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
-    problem = resolved.problem
-    windows = resolved.checkpoint.demonstrations.double()
+    experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
+    problem = experiment.problem
+    windows = experiment.checkpoint.demonstrations.double()
     inside = problem.declared(windows) > 0
     windows = windows[inside.any(1) & ~inside[:, [0, -1]].any(1)]
     reachable = dynamics_of(problem.enforced)[0]
@@ -275,7 +274,7 @@ def paths(d, horizon, batch):
     size = (0.3 * (middle - z[:, 0])[:, USED].norm(dim=1, keepdim=True)).clamp_max(0.3)
     aside = torch.stack((-middle[:, 3], middle[:, 2]), 1)
     centre = (middle[:, USED] + 0.95 * size * aside / aside.norm(dim=1, keepdim=True))[:, None]
-    level = Ellipsoid(torch.eye(2).double(), centre, size[:, None] * one, size, "outside")
+    level = Ellipsoid(torch.eye(2).double(), centre, size[:, None] * one, size, 1)
     disc = OnSegments("disc", level)
     return z, disc
 

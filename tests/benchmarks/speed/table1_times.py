@@ -18,7 +18,6 @@ import torch
 from cdiff_cli.commands.experiment import Experiment, Request
 from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.evaluation import tables
-from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.paths import home
 from cdiff_cli.planning.open_loop import plan
 
@@ -62,7 +61,7 @@ def asked(arguments: argparse.Namespace) -> dict[Key, Experiment]:
 
 def step_ms(one: Experiment) -> tuple[float, float]:
     """Milliseconds of a diffusion step and, of these, in the network."""
-    sampler = SamplerSettings(kernel=one.preset.sampler.kernel)
+    sampler = one.preset.sampler.model_copy(update={"extra_steps": 0, "polish": False})
     plans = plan(one.constrained, one.method, one.seeds, sampler)
     return 1e3 * plans.total_s / plans.calls, 1e3 * plans.network_s / plans.calls
 

@@ -1,4 +1,4 @@
-"""What the closed-loop benchmarks measure of the episodes of one controller."""
+"""Episodes of one controller and their metrics, for the closed-loop studies."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -13,7 +13,12 @@ from cdiff_cli.tasks.protocol import ControlTask
 
 
 class Acted(NamedTuple):
-    """Episodes, the levels f of their states [n, steps + 1, parts], a row of metrics each."""
+    """Episodes with their metrics.
+
+    done     the episodes
+    levels   f at the executed states          [n, steps + 1, parts]
+    rows     metrics, one mapping per episode
+    """
 
     done: Episodes
     levels: Any
@@ -28,9 +33,11 @@ class Acted(NamedTuple):
         return f"{reward.mean():.0f} ± {reward.std(ddof=1) / len(reward) ** 0.5:.0f}"
 
     def violating(self) -> str:
+        """Number of episodes with an unsafe state."""
         return str(sum(row["safe_executed"] == 0 for row in self.rows))
 
     def worst(self) -> str:
+        """Largest f of an executed state."""
         return f"{max(row['executed_worst'] for row in self.rows):.3f}"
 
 
@@ -41,7 +48,10 @@ def act(
     truth: Constraint,
     env: Mapping[str, Any] | None = None,
 ) -> Acted:
-    """Episodes of all seeds together, scored by `truth`; inputs are bounded by 1 in every task."""
+    """Run one episode per seed, and score them by the constraint `truth`.
+
+    Inputs are bounded by 1 in every task.
+    """
     done = rollout(controller, task, seeds, env)
     levels = metrics.executed_levels(truth, done.x, done.observed, task.dt)
     bounds = -np.ones(done.u.shape[2]), np.ones(done.u.shape[2])

@@ -33,31 +33,29 @@ CONTROL = (
 )
 
 
-def told(values: np.ndarray) -> str:
+def mean_text(values: np.ndarray) -> str:
     """Mean and standard error."""
     return f"{values.mean():.4g} ± {values.std(ddof=1) / len(values) ** 0.5:.2g}"
 
 
 def planned(one: Experiment) -> list[str]:
     """Cells of whole plans."""
-    plans, free = (
-        plan(one.constrained, one.method, one.seeds),
-        plan(one.problem, Unconstrained(), one.seeds),
-    )
+    plans = plan(one.constrained, one.method, one.seeds)
+    free = plan(one.problem, Unconstrained(), one.seeds)
     g, checkpoint = one.declared, one.checkpoint
     assert checkpoint is not None
     rows = metrics.plan_metrics(one.task, g, plans.x, free.x, one.recipe.paper_units)
-    violation, unbound = (metrics.violation(g, each.x) for each in (plans, free))
+    violation, violation_free = metrics.violation(g, plans.x), metrics.violation(g, free.x)
     torn = np.mean(
         [not metrics.smooth(row["jump"], checkpoint.card.data["jump_q999"]) for row in rows]
     )
     wall, worst = np.mean([row["wall"] for row in rows]), max(row["worst_waypoint"] for row in rows)
     distance = np.array([row["distance"] for row in rows])
     return [
-        told(violation),
-        f"{violation.sum() / unbound.sum():.3f}",
+        mean_text(violation),
+        f"{violation.sum() / violation_free.sum():.3f}",
         f"{worst:.3f}",
-        told(distance),
+        mean_text(distance),
         f"{torn:.2f}",
         f"{wall:.2f}",
     ]
@@ -66,18 +64,18 @@ def planned(one: Experiment) -> list[str]:
 def acted(one: Experiment) -> list[str]:
     """Cells of episodes."""
     env = {"collide": False} if one.request.task == "ball-run" else {}
-    found = act(controller(one), one.task, one.seeds, one.declared, env)
+    episodes = act(controller(one), one.task, one.seeds, one.declared, env)
     rate, over = (
-        np.array([row[name] for row in found.rows])
+        np.array([row[name] for row in episodes.rows])
         for name in ("violation_rate", "executed_violation")
     )
     return [
-        found.returned(),
-        told(rate),
-        told(over),
-        found.worst(),
-        found.violating(),
-        f"{found.mean('fell'):.2f}",
+        episodes.returned(),
+        mean_text(rate),
+        mean_text(over),
+        episodes.worst(),
+        episodes.violating(),
+        f"{episodes.mean('fell'):.2f}",
     ]
 
 
@@ -88,22 +86,22 @@ def main() -> None:
     parser.add_argument("--weights", default="1,2,4,8")
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1000)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     common = {
-        "task": asked.task,
-        "constraints": asked.constraints,
+        "task": arguments.task,
+        "constraints": arguments.constraints,
         "preset": "paper",
-        "n": asked.n,
-        "seed": asked.seed,
+        "n": arguments.n,
+        "seed": arguments.seed,
     }
     runs = {"diffuser": Request(method="diffuser", **common)}
-    for weight in asked.weights.split(","):
+    for weight in arguments.weights.split(","):
         runs[weight] = Request(method="conditional", settings=(f"weight={weight}",), **common)
-    bare = resolve(runs["diffuser"])
-    acts, stem = bare.task.control == "receding_horizon", bare.constraints_path.stem
+    first = resolve(runs["diffuser"])
+    acts, stem = first.task.control == "receding_horizon", first.constraints_path.stem
     print(
-        f"{asked.task}, {stem}, preset paper, n = {asked.n}, seeds {asked.seed}-{asked.seed + asked.n - 1}\n"
+        f"{arguments.task}, {stem}, preset paper, n = {arguments.n}, seeds {arguments.seed}-{arguments.seed + arguments.n - 1}\n"
     )
     heading = CONTROL if acts else WHOLE
     print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")

@@ -62,11 +62,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    seeds = range(asked.seed, asked.seed + asked.episodes)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     table = Table(
-        title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}"
+        title=f"ball run, ghost obstacle, {arguments.episodes} episodes from seed {arguments.seed}"
     )
     for title in (
         "change",
@@ -77,8 +77,7 @@ def main() -> None:
         "saturation / %",
     ):
         table.add_column(title, justify="left" if title == "change" else "right")
-    shipped = resolve(Request(task="ball-run"))
-    truth, plain = shipped.declared, shipped.preset.sampler.model_copy(update={"polish": False})
+    ball_run = resolve(Request(task="ball-run"))
     for name, method, change, settings in ROWS:
         with tempfile.TemporaryDirectory() as folder:
             path = varied(change, Path(folder))
@@ -93,16 +92,24 @@ def main() -> None:
                     )
                 )
             )
-        found = act(
-            replace(acting, sampler=plain) if "squared" in name else acting,
-            shipped.task,
+        if "squared" in name:
+            sampler = acting.sampler.model_copy(update={"polish": False})
+            acting = replace(acting, sampler=sampler)
+        episodes = act(
+            acting,
+            ball_run.task,
             seeds,
-            truth,
+            ball_run.declared,
             {"collide": False},
         )
-        rate, saturation = f"{found.mean('violation_rate'):.3f}", f"{found.mean('saturation'):.1f}"
-        table.add_row(name, found.returned(), rate, found.violating(), found.worst(), saturation)
-        Console(stderr=True).print(name, found.returned())
+        rate, saturation = (
+            f"{episodes.mean('violation_rate'):.3f}",
+            f"{episodes.mean('saturation'):.1f}",
+        )
+        table.add_row(
+            name, episodes.returned(), rate, episodes.violating(), episodes.worst(), saturation
+        )
+        Console(stderr=True).print(name, episodes.returned())
     Console(width=130).print(table)
 
 

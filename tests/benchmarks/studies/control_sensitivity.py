@@ -56,16 +56,20 @@ def changed(task: str, alpha: float | None = None, **options: Any) -> Request:
 
 def fitted(options: Request, keep: bool) -> Experiment:
     """The problem with margins that were calibrated on it."""
-    resolved = resolve(options)
-    if resolved.margins.match in ("exact", "unused"):
-        return resolved
+    experiment = resolve(options)
+    if experiment.margins.match in ("exact", "unused"):
+        return experiment
     calibrating = resolve(replace(options, calibrate=True, n=100, seed=5000))
-    found = fit_margins(calibrating, lambda *_: None, 0.99)
+    calibration = fit_margins(calibrating, lambda *_: None, 0.99)
     if keep:
-        write_calibration(calibrating.checkpoint.path, found)
-    margins = {name: each.margin for name, each in found.margins.items()}
-    problem = replace(resolved.problem, enforced=tightened(calibrating.problem.enforced, margins))
-    return replace(resolved, problem=problem, margins=ChosenMargins(margins, "exact", found))
+        write_calibration(calibrating.checkpoint.path, calibration)
+    margins = {name: one.margin for name, one in calibration.margins.items()}
+    enforced = tightened(calibrating.problem.enforced, margins)
+    return replace(
+        experiment,
+        problem=replace(experiment.problem, enforced=enforced),
+        margins=ChosenMargins(margins, "exact", calibration),
+    )
 
 
 def approaches(h: Any) -> list[tuple[int, int]]:
@@ -114,25 +118,25 @@ def main() -> None:
     parser.add_argument("--only", default="", help="rows whose name begins so")
     parser.add_argument("--keep", action="store_true")
     parser.add_argument("--picture", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    seeds = range(asked.seed, asked.seed + asked.episodes)
-    rows = [("alpha: no constraint", changed(asked.task, method="diffuser"))]
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    rows = [("alpha: no constraint", changed(arguments.task, method="diffuser"))]
     rows += [
-        (f"alpha {alpha:g}", changed(asked.task, None if alpha == 0.85 else alpha))
+        (f"alpha {alpha:g}", changed(arguments.task, None if alpha == 0.85 else alpha))
         for alpha in ALPHAS
     ]
     rows += [
-        (f"action noise {noise:g}", changed(asked.task, action_noise=noise))
+        (f"action noise {noise:g}", changed(arguments.task, action_noise=noise))
         for noise in (0.02, 0.1, 0.25)
     ]
-    rows += [(f"execute {k}", changed(asked.task, execute=k)) for k in (2, 4, 8)]
+    rows += [(f"execute {k}", changed(arguments.task, execute=k)) for k in (2, 4, 8)]
     rows += [
-        ("warm 0.3, ddim", changed(asked.task, warm=0.3, kernel="ddim")),
-        ("warm 0.3", changed(asked.task, warm=0.3)),
+        ("warm 0.3, ddim", changed(arguments.task, warm=0.3, kernel="ddim")),
+        ("warm 0.3", changed(arguments.task, warm=0.3)),
     ]
     table = Table(
-        title=f"{asked.task}, recommended alm, {asked.episodes} episodes from seed {asked.seed}"
+        title=f"{arguments.task}, recommended alm, {arguments.episodes} episodes from seed {arguments.seed}"
     )
     titles = (
         "change",
@@ -151,51 +155,51 @@ def main() -> None:
     )
     colours = iter(["0.6", *plt.get_cmap("viridis")(np.linspace(0, 0.9, len(ALPHAS)))])
     for name, options in rows:
-        if not name.startswith(asked.only):
+        if not name.startswith(arguments.only):
             continue
-        resolved = fitted(options, asked.keep)
-        found = act(controller(resolved), resolved.task, seeds, resolved.declared)
-        h = -found.levels.max(-1)
+        experiment = fitted(options, arguments.keep)
+        episodes = act(controller(experiment), experiment.task, seeds, experiment.declared)
+        h = -episodes.levels.max(-1)
         fall = np.nanmax((h[:, :-1] - h[:, 1:]) / np.maximum(h[:, :-1], 0.05))
         rate, total = (
-            f"{found.mean('violation_rate'):.3f}",
-            f"{found.mean('executed_violation'):.3f}",
+            f"{episodes.mean('violation_rate'):.3f}",
+            f"{episodes.mean('executed_violation'):.3f}",
         )
-        margins = ", ".join(f"{margin:.2f}" for margin in resolved.margins.margins.values())
+        margins = ", ".join(f"{margin:.2f}" for margin in experiment.margins.margins.values())
         table.add_row(
             name,
             margins,
-            found.returned(),
+            episodes.returned(),
             rate,
             total,
-            found.worst(),
+            episodes.worst(),
             f"{fall:.2f}",
-            f"{found.done.fell.sum()}",
+            f"{episodes.done.fell.sum()}",
         )
         if name.startswith("alpha"):
-            alpha = None if resolved.request.method == "diffuser" else float(name.split()[1])
-            margin = max(resolved.margins.margins.values(), default=0.0)
+            alpha = None if experiment.request.method == "diffuser" else float(name.split()[1])
+            margin = max(experiment.margins.margins.values(), default=0.0)
             draw(
                 axes,
                 name.removeprefix("alpha: "),
                 h,
                 alpha,
                 margin,
-                resolved.task.dt,
+                experiment.task.dt,
                 next(colours),
             )
-        Console(stderr=True).print(name, margins, found.returned(), rate, found.worst())
+        Console(stderr=True).print(name, margins, episodes.returned(), rate, episodes.worst())
     Console(width=130).print(table)
-    if asked.picture:
+    if arguments.picture:
         for axis in axes:
             axis.axhline(0, color="#d1495b", lw=1.2)
             axis.set(xlabel="time / s")
         axes[0].set(
-            ylabel="h / rad/s, unsafe below 0", title=f"{asked.task}: distance to the limit"
+            ylabel="h / rad/s, unsafe below 0", title=f"{arguments.task}: distance to the limit"
         )
         axes[1].set(title="approaches: median, 80 %; dotted: bound")
         figure.legend(fontsize=8, frameon=False, ncols=6, loc="outside upper center")
-        figure.savefig(asked.picture, dpi=110)
+        figure.savefig(arguments.picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -37,10 +37,9 @@ def linear(episodes: list, inputs: list):
     A, B, c = (getattr(dynamics, name).float() for name in ("A", "B", "c"))
     back = torch.linalg.pinv(B)
 
-    def inverse(x: Tensor, after: Tensor) -> Tensor:
-        return torch.clamp(
-            (after - x @ A.T - c) @ back.T, dynamics.low.float(), dynamics.high.float()
-        )
+    def inverse(x: Tensor, following: Tensor) -> Tensor:
+        u = (following - x @ A.T - c) @ back.T
+        return torch.clamp(u, dynamics.low.float(), dynamics.high.float())
 
     x, u, after = (
         np.concatenate(p)
@@ -53,17 +52,15 @@ def linear(episodes: list, inputs: list):
     return inverse, np.sqrt((left**2).mean(0))
 
 
-def driven(
-    acting: Controller, inverse: Callable[[Tensor, Tensor], Tensor], ahead: int
-) -> Controller:
+def driven(acting: Controller, inverse: Callable[[Tensor, Tensor], Tensor], ahead: int = 1):
     """The controller with another inverse dynamics model."""
 
-    def between(present: Array, following: Array) -> Array:
-        states = (torch.from_numpy(x).float() for x in (present, following))
+    def input_between(x: Array, following: Array) -> Array:
         with torch.inference_mode():
-            return inverse(*states).double().numpy()
+            u = inverse(torch.from_numpy(x).float(), torch.from_numpy(following).float())
+        return u.double().numpy()
 
-    planner = replace(acting.planner, inverse_dynamics=between)
+    planner = replace(acting.planner, inverse_dynamics=input_between)
     return replace(acting, planner=planner, ahead=ahead)
 
 
@@ -71,15 +68,16 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     both = {m: controller(resolve(Request(task=NAME, method=m))) for m in ("diffuser", "alm")}
-    shipped = resolve(Request(task=NAME))
-    recipe, task = shipped.recipe, shipped.task
+    ball_run = resolve(Request(task=NAME))
+    recipe, task = ball_run.recipe, ball_run.task
     episodes = demonstrations(task, recipe.demonstrations.steps, recipe.demonstrations.seed)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     inputs = load_inputs(task, f"cdiff/{NAME}-v0")
     table = Table(
-        title=f"ball run, ghost obstacle, {asked.episodes} episodes from seed {asked.seed}"
+        title=f"ball run, ghost obstacle, {arguments.episodes} episodes from seed {arguments.seed}"
     )
     for title in (
         "inverse dynamics",
@@ -94,33 +92,27 @@ def main() -> None:
 
     def add(name: str, fits: tuple[str, str], changed: dict[str, Controller]) -> None:
         for method, acting in changed.items():
-            found = act(
-                acting,
-                task,
-                range(asked.seed, asked.seed + asked.episodes),
-                acting.declared,
-                {"collide": False},
-            )
+            acted = act(acting, task, seeds, ball_run.declared, {"collide": False})
             table.add_row(
                 name,
                 *fits,
                 method,
-                found.returned(),
-                f"{found.mean('violation_rate'):.3f}",
-                found.violating(),
+                acted.returned(),
+                f"{acted.mean('violation_rate'):.3f}",
+                acted.violating(),
             )
 
     for ahead in (1, 2, 4, 8):
         spec = InverseSpec(steps=8000, ahead=ahead)
         net, fits = fit_inverse(episodes, inputs, recipe.horizon, spec, 0)
-        told = f"{fits['windows']:.4f}", f"{fits['branches']:.4f}"
+        explained = f"{fits['windows']:.4f}", f"{fits['branches']:.4f}"
         add(
             f"network, {ahead} ahead",
-            told,
+            explained,
             {m: driven(c, net, ahead) for m, c in both.items()},
         )
     inverse, left = linear(episodes, inputs)
-    add("linear fit, 1 ahead", ("", ""), {m: driven(c, inverse, 1) for m, c in both.items()})
+    add("linear fit, 1 ahead", ("", ""), {m: driven(c, inverse) for m, c in both.items()})
     Console(width=120).print(table)
     Console(width=120).print(
         f"the linear fit leaves {', '.join(f'{v:.1e}' for v in left)} of x, y (m), vx, vy (m/s), root mean square"

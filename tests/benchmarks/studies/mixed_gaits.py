@@ -62,11 +62,11 @@ def main() -> None:
     parser.add_argument("--task", default="hopper", choices=BOUNDED)
     parser.add_argument("--episodes", type=int, default=30)
     parser.add_argument("--seed", type=int, default=100)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    task = replace(load_task(asked.task), gaits=None)
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    move_to(asked.folder, task.name)
+    task = replace(load_task(arguments.task), gaits=None)
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    move_to(arguments.folder, task.name)
     recipe = load_recipe(task.name)
     set_limits(task, recipe)
     work = Path("runs")
@@ -83,7 +83,7 @@ def main() -> None:
     )
     install(found)
     table = Table(
-        title=f"{task.name}, a planner of all gaits (R² {found.card.inverse}), {asked.episodes} episodes from {asked.seed}"
+        title=f"{task.name}, a planner of all gaits (R² {found.card.inverse}), {arguments.episodes} episodes from {arguments.seed}"
     )
     for title in (
         "constraint",
@@ -98,14 +98,16 @@ def main() -> None:
     ):
         table.add_column(title, justify="left" if title in ("constraint", "method") else "right")
     for stem in (task.name, f"{task.name}-hard"):
-        asking = Request(
+        request = Request(
             task=task.name, constraints=Path("constraints") / f"{stem}.yaml", device="cpu"
         )
-        calibrate(resolve(replace(asking, n=100, seed=5000, calibrate=True)), lambda *_: None, 0.99)
+        calibrate(
+            resolve(replace(request, n=100, seed=5000, calibrate=True)), lambda *_: None, 0.99
+        )
         for method in ("diffuser", "alm"):
-            one = resolve(replace(asking, method=method))
-            seeds = range(asked.seed, asked.seed + asked.episodes)
-            done = act(controller(one), one.task, seeds, one.declared)
+            experiment = resolve(replace(request, method=method))
+            seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+            done = act(controller(experiment), experiment.task, seeds, experiment.declared)
             reward = np.array([row["reward"] for row in done.rows])
             least, largest = f"{reward.min():.0f}", f"{reward.max():.0f}"
             counts = (

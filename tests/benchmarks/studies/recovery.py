@@ -105,15 +105,15 @@ def recovered(
 ) -> list[str]:
     """Cells of one row."""
     planned = "diffuser" if method == EXPERT else method
-    one = resolve(Request(task=task, method=planned, n=1, device="cpu"))
-    pushing: Any = Pushing(one.task, value, since, near)
+    experiment = resolve(Request(task=task, method=planned, n=1, device="cpu"))
+    pushing: Any = Pushing(experiment.task, value, since, near)
     steps = max(since) + STRIDE + STEPS
     x = (
         walked(pushing, seeds, steps)
         if method == EXPERT
-        else rollout(controller(one), pushing, seeds, steps=steps).x
+        else rollout(controller(experiment), pushing, seeds, steps=steps).x
     )
-    f = metrics.executed_levels(one.declared, x, {}, one.task.dt).max(-1)
+    f = metrics.executed_levels(experiment.declared, x, {}, experiment.task.dt).max(-1)
     after = np.stack(
         [
             row[env.at :][: STEPS + 1]
@@ -148,14 +148,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--methods", nargs="+", default=(EXPERT, "diffuser", "projected", "alm"))
     parser.add_argument("--standing", action="store_true")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    seeds = range(asked.seed, asked.seed + asked.n)
-    since = [0 if asked.standing else 300 + 4 * i for i in range(asked.n)]
-    kind = resolve(Request(task=asked.task, n=1, device="cpu")).kinds[0]
+    seeds = range(arguments.seed, arguments.seed + arguments.n)
+    since = [0 if arguments.standing else 300 + 4 * i for i in range(arguments.n)]
+    kind = resolve(Request(task=arguments.task, n=1, device="cpu")).kinds[0]
     limit = kind.barrier.b  # type: ignore[union-attr]
-    near = -np.inf if asked.standing else limit - NEAR
-    print(f"{asked.task}, limit {limit:g} rad/s, {asked.n} episodes from seed {asked.seed}\n")
+    near = -np.inf if arguments.standing else limit - NEAR
+    print(
+        f"{arguments.task}, limit {limit:g} rad/s, {arguments.n} episodes from seed {arguments.seed}\n"
+    )
     heading = (
         "pushed to",
         "method",
@@ -169,8 +171,10 @@ def main() -> None:
     print(f"| {' | '.join(heading)} |\n| {' | '.join(['---'] * len(heading))} |")
     for sign in (1, -1):
         for beyond in BEYOND:
-            for method in asked.methods:
-                cells = recovered(asked.task, method, sign * (limit + beyond), seeds, since, near)
+            for method in arguments.methods:
+                cells = recovered(
+                    arguments.task, method, sign * (limit + beyond), seeds, since, near
+                )
                 print(f"| {' | '.join(cells)} |", flush=True)
 
 

@@ -114,12 +114,12 @@ def exact_scores(n_steps):
 
 def trained_model(task, n):
     def plans(kernel, steps):
-        resolved = resolve(
+        one = resolve(
             Request(task=task, method="diffuser", n=n, random=True, kernel=kernel, steps=steps)
         )
         sampler = SamplerSettings(kernel=kernel)
-        x = plan(resolved.problem, resolved.method, resolved.seeds, sampler).x
-        return x[..., resolved.problem.planner.position_columns]
+        x = plan(one.problem, one.method, one.seeds, sampler).x
+        return x[..., one.planner.position_columns]
 
     truth = plans("dpm++2m", None)
     for kernel in DETERMINISTIC:
