@@ -10,6 +10,7 @@ tear it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TypeGuard
 
@@ -243,14 +244,23 @@ class TangentPlanes:
     def __call__(self, x: Traj) -> Rows:
         return self.linearise(x)[0]
 
-    def _values(self, x: Traj) -> Rows:
+    @cached_property
+    def leading(self) -> HalfSpaces:
+        """a [dim, batch, m, horizon] and b [batch, m, horizon], as they are in memory.
+
+        Sums over a short last dimension are several times slower.
+        """
         a, b = self.half_spaces
-        return ((a * x[:, :, None]).sum(-1) - b).transpose(1, 2).flatten(1)
+        return HalfSpaces(a.permute(3, 0, 2, 1), b.transpose(1, 2))
+
+    def _values(self, x: Traj) -> Rows:
+        a, b = self.leading
+        return ((a * x.movedim(-1, 0).contiguous()[:, :, None]).sum(0) - b).flatten(1)
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
         """The values, the pull and the bounds, as Constraint.linearise returns them."""
         parts, m = len(self.rest.parts), self.half_spaces.b.shape[2]
-        size = (parts + m) * self.half_spaces.a.square().sum(-1).transpose(1, 2).flatten(1)
+        size = (parts + m) * self.leading.a.square().sum(0).flatten(1)
         if not parts:
             return self._values(x), self._pull, size
         rows, rest_pull, rest_size = self.rest.linearise(x)
@@ -263,9 +273,8 @@ class TangentPlanes:
         )
 
     def _pull(self, w: Rows) -> Traj:
-        a = self.half_spaces.a
-        batch, horizon, m, _ = a.shape
-        return (w.reshape(batch, m, horizon).transpose(1, 2)[..., None] * a).sum(2)
+        a, b = self.leading
+        return (w.reshape(b.shape) * a).sum(2).movedim(0, -1)
 
 
 def split_excluded(g: Constraint) -> tuple[list[OnSegments], Constraint]:
@@ -294,13 +303,14 @@ def with_tangent_planes(g: Constraint, x: Traj, pins: Pins) -> Constraint | Tang
     excluding, rest = split_excluded(g)
     if not excluding:
         return g
-    a, b = tangent_half_spaces(excluding, x, pins)
+    planes = TangentPlanes(rest, tangent_half_spaces(excluding, x, pins))
+    a, b = planes.leading
     for k, part in enumerate(excluding):
         assert isinstance(part.level, Ellipsoid)
-        rows, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[..., None]
-        a[:, :, rows] *= m[..., None]
-        b[:, :, rows] = torch.where(b[:, :, rows] == NEVER, 1.0, m * b[:, :, rows])
-    return TangentPlanes(rest, HalfSpaces(a, b))
+        rows, m = slice(2 * k, 2 * k + 2), part.level.m.expand(x.shape[:2])[:, None]
+        a[:, :, rows] *= m
+        b[:, rows] = torch.where(b[:, rows] == NEVER, 1.0, m * b[:, rows])
+    return planes
 
 
 def normals(level: Ellipsoid, x: Traj, pins: Pins) -> Tensor:
