@@ -140,7 +140,7 @@ def main():
         x, _ = execute(recipe_runs()[0], at, seeds_of(arguments.seed, batch, arguments.n))
         pairs.append(energy_distance(x, law.draw(arguments.n, rng).numpy()))
     console.print(
-        f"without a constraint, {at.schedule.n_steps} DDPM steps against exact samples: energy {show(pairs)} m"
+        f"without a constraint, {at.planner.schedule.n_steps} DDPM steps against exact samples: energy {show(pairs)} m"
     )
     results = {}
     for name in arguments.constraints.split(","):
