@@ -14,17 +14,21 @@ Pull = Callable[[Rows], Traj]
 
 
 def dot(x: Tensor, a: Tensor) -> Tensor:
-    """a.x over the last dimension."""
+    """The product a.x over the last dimension."""
     return x @ a if a.ndim == 1 else (x * a).sum(-1)
 
 
 def times(x: Tensor, P: Tensor) -> Tensor:
-    """x.P for states [..., dim] and one matrix, or one for each of them."""
+    """The product x.P for states x [..., dim] and one matrix P, or one matrix per state."""
     return x @ P if P.ndim == 2 else (x[..., None, :] @ P)[..., 0, :]
 
 
 def each_end(p: Tensor, trailing: int) -> tuple[Tensor, Tensor]:
-    """A number of the level at the first and at the last waypoint of each segment."""
+    """A parameter of a state set at the first and at the last waypoint of each segment.
+
+    p          [...], or with the horizon in front of its last `trailing` dimensions
+    trailing   number of dimensions that the parameter has at one waypoint
+    """
     axis = p.ndim - 1 - trailing
     if axis < 0 or p.shape[axis] == 1:
         return p, p

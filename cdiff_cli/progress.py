@@ -1,4 +1,4 @@
-"""Progress bars on stderr, shown on a terminal alone."""
+"""Progress bars on stderr, shown only on a terminal."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,12 +8,12 @@ from rich.console import Console
 
 err = Console(stderr=True)
 Tick = Callable[[str, int, int], None]
-"""(what, done, of how many)"""
+"""Called with what is under way, how many of it are done, and of how many."""
 
 
 @contextmanager
 def progress() -> Iterator[Tick]:
-    """A bar for each `what` that it is called with."""
+    """Show one bar per thing under way that the tick is called with."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -41,7 +41,11 @@ def progress() -> Iterator[Tick]:
 
 @contextmanager
 def training_progress() -> Iterator[tuple[Callable[[int, int], None], Callable[[Any], None]]]:
-    """Bars for the demonstrations, told (steps done, of how many), and for the training, told its status."""
+    """Show one bar for the demonstrations and one per network in training.
+
+    Yields (on_data, on_step). on_data is called with the steps done and of how many; on_step with
+    the training's status: what, step, steps, loss.
+    """
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -51,31 +55,23 @@ def training_progress() -> Iterator[tuple[Callable[[int, int], None], Callable[[
         TimeRemainingColumn,
     )
 
-    shape = "{task.description:>16}", "{task.fields[loss]}", "{task.fields[rate]}"
     columns = (
-        TextColumn(shape[0]),
+        TextColumn("{task.description:>16}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn(shape[1]),
-        TextColumn(shape[2]),
-    )
-    with Progress(
-        *columns,
+        TextColumn("{task.fields[loss]}"),
+        TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        console=err,
-        disable=not err.is_terminal,
-    ) as bar:
+    )
+    with Progress(*columns, console=err, disable=not err.is_terminal) as bar:
         data: Any = None
         fits: dict[str, Any] = {}
 
         def on_data(done: int, total: int) -> None:
             nonlocal data
-            data = (
-                bar.add_task("demonstrations", total=total, loss="", rate="")
-                if data is None
-                else data
-            )
+            if data is None:
+                data = bar.add_task("demonstrations", total=total, loss="", rate="")
             bar.update(data, completed=done)
 
         def on_step(status: Any) -> None:

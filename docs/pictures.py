@@ -15,15 +15,16 @@ import torch
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from cdiff_cli.commands.resolve import Options, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
-from cdiff_cli.constraints.dynamics import LinearDynamics, Reachable
+from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.segments import Segments
+from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import Ellipsoid
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.evaluation import conformal, metrics
-from cdiff_cli.planning.receding_horizon import control
+from cdiff_cli.planning.receding_horizon import rollout
 from cdiff_cli.projection.project import project
 from cdiff_cli.projection.solvers.sphere_normals import normals_of
 
@@ -40,7 +41,7 @@ def disc(dim: int, radius: float = 1.0) -> Ellipsoid:
         torch.zeros(2, dtype=torch.float64),
         torch.full((2,), radius, dtype=torch.float64),
         torch.tensor(radius),
-        1,
+        "outside",
     )
 
 
@@ -64,7 +65,7 @@ def segments_picture() -> None:
     level = disc(2)
     distance = z.norm(dim=-1, keepdim=True)
     pushed = torch.where(distance < 1, z / distance, z)
-    x = project(Constraint((Segments("disc", level),)), z, ends(z))
+    x = project(Constraint((OnSegments("disc", level),)), z, ends(z))
     n = normals_of(z, ends(z).mask.all(1))[0]
     inside = ((z[0, 1:] + z[0, :-1]) / 2).norm(dim=-1) < 1.1
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 4.1), sharey=True)
@@ -109,9 +110,10 @@ def dynamics_picture(dt: float = 0.1, bound: float = 3.0, horizon: int = 48) -> 
     p = torch.stack((-2.4 + 4.8 * s, 0.25 + 0 * s), -1)
     v = torch.stack((4.8 * 6 * tau * (1 - tau) / (dt * (horizon - 1)), 0 * tau), -1)
     z = torch.cat((p, v), -1)[None]
-    around = Segments("disc", disc(4))
+    around = OnSegments("disc", disc(4))
     plain = project(Constraint((around,)), z, ends(z))
-    reachable = project(Constraint((around, Reachable.of("dynamics", dynamics, 1e-5))), z, ends(z))
+    exact = LinearDynamicsConstraint.from_dynamics("dynamics", dynamics, 1e-5)
+    reachable = project(Constraint((around, exact)), z, ends(z))
     figure, (left, right) = plt.subplots(
         1, 2, figsize=(9.5, 3.7), gridspec_kw={"width_ratios": [1.35, 1]}
     )
@@ -149,7 +151,7 @@ def dynamics_picture(dt: float = 0.1, bound: float = 3.0, horizon: int = 48) -> 
 def margins_picture(episodes: int = 20, seed: int = 1000, level: float = 0.95) -> None:
     """Hopper at its harder limit with no margin: `--margin 0`."""
     file = Path("constraints/hopper-hard.yaml")
-    options = Options(
+    request = Request(
         task="hopper",
         method="alm",
         constraints=file,
@@ -158,14 +160,15 @@ def margins_picture(episodes: int = 20, seed: int = 1000, level: float = 0.95) -
         margin=0.0,
         device="cpu",
     )
-    acting = controller(resolve(options))
-    done = control(acting, list(range(seed, seed + episodes)), {})
-    executed = metrics.executed_levels(acting.g, done.x, done.observed, acting.task.dt)
-    part = [part.name for part in acting.g.parts].index("thigh-down")
-    scores = np.sort(conformal.errors(done.foreseen, executed)[:, part])
+    experiment = resolve(request)
+    task, g = experiment.task, experiment.declared
+    done = rollout(controller(experiment), task, experiment.seeds)
+    executed = metrics.executed_levels(g, done.x, done.observed, task.dt)
+    part = [part.name for part in g.parts].index("thigh-down")
+    scores = np.sort(conformal.errors(done.predicted_levels, executed)[:, part])
     margin = conformal.conformal(scores, level)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6))
-    planned, real = -done.foreseen[:, 1:, part].ravel(), -executed[:, 1:, part].ravel()
+    planned, real = -done.predicted_levels[:, 1:, part].ravel(), -executed[:, 1:, part].ravel()
     left.plot(planned, real, ".", color=BLUE, ms=1.5, alpha=0.4, rasterized=True)
     left.plot([-0.2, 1], [-0.2, 1], color="k", lw=0.8)
     left.axhline(0, color=RED, lw=1)

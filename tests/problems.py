@@ -40,7 +40,7 @@ def normal(seed, *shape, scale=1.0):
     return scale * torch.randn(*shape, generator=generator(seed), dtype=F64)
 
 
-# levels and constraints -----------------------------------------------------------------------------------------------
+# state sets and constraints ---------------------------------------------------------------------------
 
 
 def half_space(a=(1.0, -1.0), b=0.2):
@@ -65,18 +65,20 @@ def ellipsoid(side, centre=(0.3, -0.2), axes=(0.5, 1.2)):
 
 
 def saddle():
-    """x^2 - 0.5 y^2 + 0.6 x y + 0.3 x - 0.1 y <= 0.4: neither convex nor the complement of a convex set."""
+    """x^2 - 0.5 y^2 + 0.6 x y + 0.3 x - 0.1 y <= 0.4: neither convex nor the complement of a convex
+    set.
+    """
     return Quadric(torch.tensor([[1.0, 0.3], [0.3, -0.5]], dtype=F64), vec(0.3, -0.1), num(0.4))
 
 
 LEVELS = {
     "half-space": half_space(),
-    "inside ball": ball(-1),
-    "outside ball": ball(1),
-    "inside ball squared": ball(-1).quadric(),
-    "outside ball squared": ball(1).quadric(),
-    "inside ellipsoid": ellipsoid(-1),
-    "outside ellipsoid": ellipsoid(1),
+    "inside ball": ball("inside"),
+    "outside ball": ball("outside"),
+    "inside ball squared": ball("inside").quadric(),
+    "outside ball squared": ball("outside").quadric(),
+    "inside ellipsoid": ellipsoid("inside"),
+    "outside ellipsoid": ellipsoid("outside"),
     "general quadric": saddle(),
 }
 
@@ -100,14 +102,14 @@ KINDS = {
     "stack": Constraint(
         (
             AtWaypoints("a", half_space()),
-            DiscreteBarrier("b", ball(1), 0.4),
-            AtWaypoints("e", ellipsoid(-1)),
+            DiscreteBarrier("b", ball("outside"), 0.4),
+            AtWaypoints("e", ellipsoid("inside")),
         )
     ),
 }
 
 
-# pins -----------------------------------------------------------------------------------------------------------------
+# pins ---------------------------------------------------------------------------------------------
 
 
 def pin(x, *waypoints, columns=None):
@@ -118,7 +120,7 @@ def pin(x, *waypoints, columns=None):
     return Pins(mask, x)
 
 
-# references -----------------------------------------------------------------------------------------------------------
+# references ---------------------------------------------------------------------------------------
 
 
 def qp_project(A, b, z, fixed=None):
@@ -140,8 +142,10 @@ def qp_project(A, b, z, fixed=None):
 
 
 def least_distance(A, b, z):
-    """min |x - z|^2 s.t. A x <= b, by non-negative least squares (Lawson and Hanson, 1974, chapter 23): exact in sharp corners,
-    where ProxQP may find nothing."""
+    """min |x - z|^2 s.t. A x <= b, by non-negative least squares (Lawson and Hanson, 1974, ch. 23).
+
+    It is exact in sharp corners, where ProxQP may find nothing.
+    """
     matrix = np.vstack((-A.T, A @ z - b))
     u, _ = nnls(matrix, np.append(np.zeros(len(z)), 1.0))
     r = matrix @ u - np.append(np.zeros(len(z)), 1.0)
@@ -159,7 +163,7 @@ def nearest_of(points, z):
     return torch.cdist(z, points).min(1).values
 
 
-# samplers with known answers ------------------------------------------------------------------------------------------
+# samplers with known answers ----------------------------------------------------------------------
 
 UNIT_MEAN_SHIFT = waypoints(
     HalfSpace(vec(-1.0), num(-1.0))
@@ -167,7 +171,9 @@ UNIT_MEAN_SHIFT = waypoints(
 
 
 def langevin_chain(method, g, *, steps, batch, beta, seed):
-    """Unadjusted Langevin of N(0, 1) under `method`: final samples [batch, 1, 1] and the state after each step."""
+    """Unadjusted Langevin of N(0, 1) under `method`: final samples [batch, 1, 1] and the state
+    after each step.
+    """
     rng = generator(seed)
     x = torch.randn(batch, 1, 1, generator=rng, dtype=F64)
     pins, state, states = Pins.none(x), method.init(x, g), []
@@ -198,11 +204,14 @@ def draws(seed, *shape):
     return lambda: torch.randn(*shape, generator=rng, dtype=F64)
 
 
-QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; hundreds of coupled ones with alpha = 1e-3 cost digits
+QP = 1e-6  # accuracy of ProxQP: 1e-9 per constraint, less for hundreds of coupled ones
 
 
 def nearest_chain(h, gamma, weight, fixed):
-    """The nearest chain as projection/barrier.py finds it, v_k = h_k where fixed [n]: a first and a last run of indices."""
+    """The nearest values to h that satisfy a barrier, as projection/barrier.py computes them.
+
+    fixed   indices with v_k = h_k, at the start and at the end [n]
+    """
     free = torch.nonzero(~fixed)[:, 0]
     first, last = (int(free[0]), int(free[-1]) + 1) if len(free) else (0, 0)
     return nearest_between(h, gamma, weight, first, last)
@@ -224,7 +233,10 @@ def qp_projection(g, z, pins=None):
 
 
 def refused_at(path, start):
-    """Loading the constraint file ends with an error that names the file and begins `start` after it: line, field, complaint."""
+    """Loading the file raises a SpecError that starts with the file and then `start`.
+
+    start   line, field and complaint
+    """
     with pytest.raises(SpecError) as caught:
         load_constraints(path, "maze2d-umaze", ("x", "y", "vx", "vy"))
     assert str(caught.value).startswith(f"{path}:{start}"), str(caught.value)

@@ -20,7 +20,7 @@ LAYERS = [
     {"sampling", "tasks"},
     {"planning", "training"},
     {"evaluation"},
-    {"commands"},
+    {"commands", "api"},
     {"cli"},
 ]
 """A folder or file imports from lower layers only; those of one layer do not import each other."""
@@ -70,13 +70,16 @@ def test_imports_point_down():
         for name, path in MODULES.items()
         if name
         for other, _ in own(path)
+        if other  # the version, which stands in the package itself
     }
     assert ("commands", "evaluation") in arrows  # the check sees imports
     assert [f"{a} imports {b}" for a, b in sorted(arrows) if a != b and rank[a] <= rank[b]] == []
 
 
 def test_no_two_files_import_each_other():
-    graph = {name: {other for other, _ in own(path)} for name, path in MODULES.items()}
+    graph = {
+        name: {other for other, _ in own(path) if other} for name, path in MODULES.items() if name
+    }
     done: set[str] = set()
     while free := {
         name for name, needs in graph.items() if name not in done and not (needs - {name} - done)
@@ -117,8 +120,10 @@ def test_the_mathematics_knows_no_environment():
         "cdiff_cli",
         "cdiff_cli.cli",
         "cdiff_cli.sampling",
-        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
         "cdiff_cli.yaml_files, cdiff_cli.paths, cdiff_cli.machine",
+        "cdiff_cli.commands.compare, cdiff_cli.commands.run_directory",
+        "cdiff_cli.commands.list_names",
+        "cdiff_cli.commands.options, cdiff_cli.commands.names, cdiff_cli.commands.rerun",
         "cdiff_cli.evaluation.columns, cdiff_cli.evaluation.comparison, cdiff_cli.evaluation.statistics, cdiff_cli.evaluation.tables",
     ],
 )

@@ -39,7 +39,7 @@ def fit_margins(experiment: Experiment, tick: Tick, level: float) -> Calibration
     request, n = experiment.request, experiment.request.n
     require_enough(n, level)
     acting, task = controller(experiment), cast(ControlTask, experiment.task)
-    declared, env = experiment.declared, parse_env(task, request.env)
+    declared, env = experiment.declared, parse_env(task, experiment.preset.control.env)
     names = [part.name for part in declared.parts]
 
     def measured(margins: Array, number: int) -> Array:

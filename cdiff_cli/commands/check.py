@@ -8,23 +8,22 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint
-from cdiff_cli.constraints.observed import Observed
-from cdiff_cli.constraints.rate import RateLimit
 from cdiff_cli.constraints.spec.load import load_constraints
-from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.evaluation.figures import plans as plan_figures
+from cdiff_cli.evaluation.layout import plain_table
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
-from cdiff_cli.projection.project import has_exact_form
+from cdiff_cli.projection.projectors import projection_method
 from cdiff_cli.tasks import load_task
 from cdiff_cli.yaml_files import Document
 
 
 def check(file: Path, picture: Path, out: Console) -> None:
-    """Print the constraints of a file: rows, coordinates, units, projection, share of demonstrations that satisfy them; draw
-    them over those demonstrations.
+    """Print what the constraints of a file mean, and draw them over the demonstrations.
+
+    Per constraint: rows, coordinates with units, projection, share of demonstrations that
+    satisfy it.
     """
     document = Document(file)
     name = document.value.get("task") if isinstance(document.value, dict) else None
@@ -43,46 +42,49 @@ def check(file: Path, picture: Path, out: Console) -> None:
     demonstrations = checkpoint.demonstrations.double() if checkpoint else None
     unit = dict(zip(task.layout, task.units, strict=True))
     count = "1 constraint" if len(kinds) == 1 else f"{len(kinds)} constraints, all of them at once,"
-    table = Table(title=f"{file}: {count} on {name}", title_justify="left")
-    for heading in (
-        "name",
-        "kind",
-        "meaning",
-        "rows",
-        "coordinates",
-        "projection",
-        "demonstrations that obey",
-    ):
-        table.add_column(heading, overflow="fold")
-    for spec, part in zip(kinds, g.parts, strict=True):
-        form = (
-            part.example(recipe.horizon)[0] if isinstance(part, Observed) else part
-        )  # its form, where its numbers are observed
+    out.print(f"{file}: {count} on {name}", highlight=False, markup=False, style="italic")
+    meanings = Table.grid(padding=(0, 2))
+    meanings.add_column(no_wrap=True, style="bold")
+    meanings.add_column()
+    table = plain_table()
+    for heading in ("name", "kind"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("rows", justify="right")
+    table.add_column("coordinates", overflow="fold")
+    table.add_column("projection")
+    table.add_column("demonstrations", justify="right")
+    forms = g.example(recipe.horizon).parts
+    for spec, part, form in zip(kinds, g.parts, forms, strict=True):
         used = dict.fromkeys(coordinate for _, coordinate in spec.coordinates())
         obey = (
             ""
             if demonstrations is None or form is not part
-            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%}"
+            else f"{float((part(demonstrations) <= 0).all(1).double().mean()):.0%} satisfy it"
         )
+        meanings.add_row(escape(spec.name), escape(spec.describe()))
         table.add_row(
             escape(spec.name),
             spec.kind,
-            escape(spec.describe()),
             str(len(form.labels(recipe.horizon))),
             escape(", ".join(f"{c} [{unit[c]}]" if unit[c] else c for c in used)),
-            _projection(form),
+            projection_method(form),
             obey,
         )
-    out.print(table)
-    fixed = Constraint(tuple(part for part in g.parts if not isinstance(part, Observed)))
+    out.print(meanings, highlight=False)
+    out.print()
+    out.print(table, highlight=False)
+    out.print()
+    fixed = g.known()
     if len(task.positions) != 2:
         out.print(
-            f"picture  none: the states of {name} have no place in the plane; `cdiff rollout` draws h over time"
+            f"picture  none: the states of {name} have no place in the plane; "
+            "`cdiff rollout` draws h over time"
         )
         return
     if not fixed.parts:
         out.print(
-            "picture  none: where these constraints lie is observed only while acting; `cdiff rollout` draws them"
+            "picture  none: where these constraints lie is observed only while acting; "
+            "`cdiff rollout` draws them"
         )
         return
     picture.parent.mkdir(parents=True, exist_ok=True)
@@ -91,12 +93,3 @@ def check(file: Path, picture: Path, out: Console) -> None:
         picture, task, fixed, np.empty((0, 2, len(task.layout))), sample, file.stem
     )
     out.print(f"picture  {picture}", highlight=False, soft_wrap=True)
-
-
-def _projection(form: TrajectoryConstraint) -> str:
-    """How the nearest trajectory that obeys it is found (project.py)."""
-    if isinstance(form, LinearDynamicsConstraint):
-        return "active set"
-    if isinstance(form, RateLimit):
-        return "ADMM"
-    return "exact" if has_exact_form(form) else "sequential (ProxQP)"

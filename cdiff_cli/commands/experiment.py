@@ -109,6 +109,11 @@ class Experiment:
         return self.problem.declared
 
     @property
+    def replans(self) -> bool:
+        """Whether the task plans anew at every step."""
+        return self.task.control == "receding_horizon"
+
+    @property
     def seeds(self) -> list[int]:
         """One per plan or episode."""
         return list(range(self.request.seed, self.request.seed + self.request.n))
@@ -120,7 +125,7 @@ class Experiment:
 
     @property
     def note(self) -> str:
-        """One line where margins were calibrated on something else than is asked for, or not at all."""
+        """One line where margins were not calibrated for this request; else nothing."""
         command = self.request.calibration_command
         return self.margins.note(self.preset, str(self.constraints_path), command)
 
@@ -153,7 +158,8 @@ class Experiment:
 
     def constraints_record(self) -> dict[str, Any]:
         """File, hash and content of the constraints."""
-        content = [kind.model_dump(mode="json", exclude_none=True) for kind in self.kinds]  # type: ignore[attr-defined]
+        kinds: Sequence[Any] = self.kinds
+        content = [kind.model_dump(mode="json", exclude_none=True) for kind in kinds]
         return {
             "file": str(shown(self.constraints_path)),
             "sha256": hashlib.sha256(self.constraints_path.read_bytes()).hexdigest(),

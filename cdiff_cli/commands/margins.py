@@ -5,7 +5,8 @@ of margins is therefore kept with the preset it was calibrated with; one constra
 several sets. A rollout takes the first of these that exists, and says which:
 
 exact       the same constraints and an equal preset
-other       the same constraints: the same method first, then the fewest differences, then the latest
+other       the same constraints: the same method first, then the fewest differences, then the
+            latest
 renumbered  a file of the same name whose constraints, of equal names, say something else (another
             alpha, another limit): the same method first, then the fewest differences, then the
             widest margin
@@ -155,8 +156,10 @@ def read_calibrations(checkpoint: Path) -> list[Calibration]:
 
 
 def write_calibration(checkpoint: Path, found: Calibration) -> Path:
-    """Add to those beside the checkpoint, in the place of one of the same constraints and conditions; those of other weights, which
-    nothing can use, are left out. Written elsewhere and renamed.
+    """Add a calibration to those beside the checkpoint.
+
+    It replaces one of the same constraints and an equal preset. Calibrations for other weights,
+    which nothing can use, are left out. The file is written elsewhere and renamed.
     """
 
     def replaced(each: Calibration) -> bool:

@@ -1,4 +1,4 @@
-"""From a request to an experiment: names found, planner loaded, constraints compiled, ends checked."""
+"""From a request to an experiment: find, load, decide, compile, check, in that order."""
 
 import math
 from collections.abc import Sequence
@@ -10,8 +10,7 @@ import torch
 from cdiff_cli.arrays import Array
 from cdiff_cli.commands.experiment import Experiment, Request
 from cdiff_cli.commands.margins import ChosenMargins, choose_margins, read_calibrations
-from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of
-from cdiff_cli.constraints.rate import RateLimit
+from cdiff_cli.constraints.dynamics import LinearDynamicsConstraint, dynamics_of, weighted
 from cdiff_cli.constraints.spec.kinds import DYNAMICS_TOLERANCE
 from cdiff_cli.constraints.spec.load import Kind, enforced, kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
@@ -81,7 +80,7 @@ def resolve(request: Request) -> Experiment:
     )
 
 
-# 1. Names exist, options apply ---------------------------------------------------------------------
+# 1. Names exist, options apply --------------------------------------------------------------------
 
 
 def find(request: Request) -> tuple[Task, Recipe]:
@@ -129,12 +128,12 @@ def _refuse_ignored_options(request: Request, control: bool) -> None:
         )
 
 
-# 2. The planner: a checkpoint, or an exact score ---------------------------------------------------
+# 2. The planner: a checkpoint, or an exact score --------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A planner with its trained schedule, and the checkpoint it is from; None for an exact score."""
+    """A planner with its trained schedule, and its checkpoint; None for an exact score."""
 
     planner: Planner
     checkpoint: Checkpoint | None
@@ -205,7 +204,7 @@ def load_conditional(
     return found
 
 
-# 3. The preset and the method ----------------------------------------------------------------------
+# 3. The preset and the method ---------------------------------------------------------------------
 
 
 def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Preset, Method]:
@@ -232,7 +231,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
             "sampler.return_weight": 0.0
             if method.planner == "conditional"
             else loaded.return_weight,
-            "control.env": tuple(sorted(request.env)),
+            "control.env": tuple(sorted(request.env or own.control.env)),
             "methods": {request.method: complete_settings(request.method, constants)},
         }
     )
@@ -242,7 +241,7 @@ def decide(request: Request, recipe: Recipe, loaded: Loaded) -> tuple[Preset, Pr
         "sampler.extra_steps": request.extra_steps,
         "control.execute": request.execute,
         "control.warm_start": request.warm,
-        "control.action_noise": request.action_noise,
+        "control.action_noise": request.action_noise or None,
         "enforce.dynamics": False if request.no_dynamics else None,
         "methods": {request.method: complete_settings(request.method, chosen)},
     }
@@ -264,7 +263,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, str]:
     return pairs
 
 
-# 4. The constraints --------------------------------------------------------------------------------
+# 4. The constraints -------------------------------------------------------------------------------
 
 
 def compile_constraints(
@@ -272,16 +271,10 @@ def compile_constraints(
 ) -> tuple[Path, list[Kind], Constraint]:
     """The constraint file, its kinds, and the g(x) <= 0 they declare."""
     path = request.constraints or shown(home() / "constraints" / recipe.constraints)
-    observable = observable_of(task)
     kinds, declared = load_constraints(
-        path,
-        task.name,
-        task.layout,
-        loaded.planner.dynamics,
-        observable,
-        task.dt,
+        path, task.name, task.layout, loaded.planner.dynamics, observable_of(task), task.dt
     )
-    limited = [part.name for part in declared.parts if isinstance(part, RateLimit)]
+    limited = [kind.name for kind in kinds if kind.kind == "rate"]
     if limited and task.control == "receding_horizon":
         raise CdiffError(
             f'"{limited[0]}": `kind: rate` is for whole plans, '
@@ -304,10 +297,7 @@ def enforced_form(
     weight = torch.tensor(
         [slow if name in task.velocities else 1.0 for name in task.layout], dtype=torch.float64
     )
-    parts = tuple(
-        replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
-        for part in parts
-    )
+    parts = weighted(Constraint(parts), weight).parts
     same = len(parts) == len(declared.parts) and all(
         part is one for part, one in zip(parts, declared.parts, strict=True)
     )
@@ -334,7 +324,7 @@ def margins_for(
     return choose_margins(known, weights, path.stem, content, request.method, preset)
 
 
-# 5. Start and goal ---------------------------------------------------------------------------------
+# 5. Start and goal --------------------------------------------------------------------------------
 
 
 def ends(

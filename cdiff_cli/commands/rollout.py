@@ -35,7 +35,7 @@ from cdiff_cli.planning.execution import Rollout, follow
 from cdiff_cli.planning.receding_horizon import Controller, rollout
 from cdiff_cli.tasks.protocol import Brakes, ControlTask, HasEnvOptions, Task, Tracks
 
-# Whole plans ---------------------------------------------------------------------------------------
+# Whole plans --------------------------------------------------------------------------------------
 
 
 def rollout_run(
@@ -95,7 +95,7 @@ def _write_executed(path: Path, experiment: Experiment, executed: Rollout) -> No
     np.savez_compressed(path / "rollout.npz", **arrays)
 
 
-# Control tasks -------------------------------------------------------------------------------------
+# Control tasks ------------------------------------------------------------------------------------
 
 
 def control_run(
@@ -113,7 +113,7 @@ def control_run(
     """
     acting, request = controller(experiment), experiment.request
     task, g = cast(ControlTask, experiment.task), experiment.declared
-    env = parse_env(task, request.env) | ({"render": True} if video else {})
+    env = parse_env(task, experiment.preset.control.env) | ({"render": True} if video else {})
     with new_run(root, name or run_name("rollout", experiment)) as run:
         recorder = None
         if video:
@@ -215,7 +215,8 @@ def _control_rows(experiment: Experiment, done: Episodes, levels: Array) -> list
     measured = metrics.control_metrics(done, levels, bounds)
     row = experiment.row()
     # The obstacle that was met is part of what was asked.
-    row["constraints"] = " ".join((row["constraints"], *experiment.request.env))
+    options = experiment.request.env or experiment.preset.control.env
+    row["constraints"] = " ".join((row["constraints"], *options))
     return [
         row | {"seed": seed} | values
         for seed, values in zip(experiment.seeds, measured, strict=True)

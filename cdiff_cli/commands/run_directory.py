@@ -1,4 +1,4 @@
-"""Run directories: a run appears only when it is whole; its rows, its configuration."""
+"""Run directories: a run appears only when it is whole. Its rows.csv and run.yaml."""
 
 import contextlib
 import csv
@@ -17,7 +17,10 @@ from cdiff_cli.yaml_files import Dumper
 
 
 class NewRun:
-    """A run being written: `path` is the temporary directory, and the final one once the `new_run` block has ended."""
+    """A run being written.
+
+    path   the temporary directory; after the `new_run` block the final one
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -25,7 +28,10 @@ class NewRun:
 
 @contextlib.contextmanager
 def new_run(root: Path, name: str) -> Iterator[NewRun]:
-    """A directory to write a run into; it appears below root only when the block ends without an error."""
+    """A directory to write a run into.
+
+    It appears below root, as <time>-<name>, only when the block ends without an error.
+    """
     root.mkdir(parents=True, exist_ok=True)
     stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
     partial = Path(tempfile.mkdtemp(prefix=f".{stem}-", dir=root))
@@ -42,7 +48,7 @@ def new_run(root: Path, name: str) -> Iterator[NewRun]:
 
 
 def find_rows(root: Path) -> list[Path]:
-    """All rows.csv below root, those of unfinished runs left out."""
+    """All rows.csv of the finished runs in a folder."""
     return sorted(p for p in root.glob("*/rows.csv") if not p.parent.name.startswith("."))
 
 
@@ -54,7 +60,7 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows with their metrics as numbers; CdiffError where the file is not one of ours."""
+    """Rows with their metrics as numbers; raises CdiffError where the file holds no rows."""
     try:
         with path.open(newline="") as file:
             reader = csv.DictReader(file)
@@ -63,9 +69,8 @@ def read_rows(path: Path) -> list[Row]:
         raise CdiffError(f"{path}: cannot be read: {error}") from None
     for number, row in numbered:
         if any(row.get(key) is None for key in KEYS):
-            raise CdiffError(
-                f"{path}:{number}: not a row of a run: it lacks {', '.join(k for k in KEYS if row.get(k) is None)}"
-            )
+            lacking = ", ".join(key for key in KEYS if row.get(key) is None)
+            raise CdiffError(f"{path}:{number}: not a row of a run: it lacks {lacking}")
         for name in row:
             if name in COLUMNS and row[name] not in ("", None):
                 try:
@@ -82,7 +87,7 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def merge_kinds(root: Path) -> tuple[list[Row], list[Row]]:
-    """(rows of plans, rows of rollouts) of all runs below root, oldest first."""
+    """The rows of plans and the rows of rollouts of all runs in a folder, oldest run first."""
     plans: list[Row] = []
     rollouts: list[Row] = []
     for path in find_rows(root):

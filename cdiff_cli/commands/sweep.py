@@ -1,7 +1,8 @@
-"""A whole `cdiff sweep`: a matrix of runs, one seed each, of which the missing ones are made by joblib's processes.
+"""`cdiff sweep`: a matrix of runs, one seed each; joblib's processes make the missing ones.
 
-A run of one seed does not depend on its neighbours, and each works on one thread: so the numbers are the same to the last digit
-however many jobs there are and wherever a sweep was broken off. Times are not: they are of a batch of one on a busy machine.
+A run of one seed does not depend on its neighbours and works on one thread. The numbers are
+therefore equal to the last digit, however many jobs there are and wherever a sweep was
+interrupted. Times are not: they are of a batch of one on a busy machine.
 """
 
 import contextlib
@@ -20,20 +21,19 @@ from rich.live import Live
 from rich.table import Table
 
 from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.names import check_choice, check_sweep
 from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.run_directory import find_rows, read_rows
-from cdiff_cli.errors import CdiffError, suggestion
+from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.columns import Row
 from cdiff_cli.models.recipe import load_recipe
-from cdiff_cli.sampling import METHODS
-from cdiff_cli.tasks import load_task
 
 BACKENDS = ("local", "ray", "dask")
 
 
 @dataclass(frozen=True)
 class Matrix:
-    """What was asked for; constraints None are the task's own."""
+    """The requested runs; constraints None are the task's own."""
 
     tasks: Sequence[str]
     methods: Sequence[str]
@@ -48,7 +48,8 @@ class Matrix:
 class Job:
     """One run of the matrix.
 
-    name    of its directory, after the time: what was asked for, and a digest of all that decides its result but the code
+    name    of its directory, after the time: the request, and a digest of all that decides its
+            result but the code
     group   task, constraints, method and preset
     """
 
@@ -60,7 +61,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A job that is over; its error where it failed, and whether its run is kept but its episode diverged."""
+    """A job that is over.
+
+    error      why it failed; None where it did not
+    diverged   its run is kept, but its episode diverged
+    """
 
     job: Job
     seconds: float
@@ -69,17 +74,20 @@ class Outcome:
 
     @property
     def trouble(self) -> str | None:
-        """What there is to tell of it, in a line."""
+        """One line where it failed or diverged."""
         if self.error is not None:
             return f"failed: {self.job.name}: {self.error}"
         if self.diverged:
-            return f"diverged: {self.job.name}: a plan or a state was no longer finite; what was done until then is kept"
+            return (
+                f"diverged: {self.job.name}: a plan or a state was no longer finite; "
+                "what was done until then is kept"
+            )
         return None
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The jobs of a matrix: those whose directory is whole, those to do, and those that cannot even begin."""
+    """The jobs of a matrix: done (its directory is whole), to do, or refused before it began."""
 
     done: Sequence[Outcome]
     todo: Sequence[Job]
@@ -87,9 +95,11 @@ class Plan:
 
 
 def plan_sweep(matrix: Matrix, root: Path) -> Plan:
-    """Sort the matrix by what lies below root; CdiffError where a name in it is unknown."""
+    """Sort the jobs of a matrix by what lies below root; raises CdiffError for an unknown name."""
     _check_names(matrix)
-    there = {path.parent.name.partition("-")[2].partition("-")[2]: path for path in find_rows(root)}
+    existing = {
+        path.parent.name.partition("-")[2].partition("-")[2]: path for path in find_rows(root)
+    }
     done: list[Outcome] = []
     todo: list[Job] = []
     refused: list[Outcome] = []
@@ -99,8 +109,8 @@ def plan_sweep(matrix: Matrix, root: Path) -> Plan:
         for job in _jobs(matrix, task, constraints, preset, method):
             if isinstance(job, Outcome):
                 refused.append(job)
-            elif job.name in there:
-                done.append(Outcome(job, 0.0, diverged=_diverged(read_rows(there[job.name]))))
+            elif job.name in existing:
+                done.append(Outcome(job, 0.0, diverged=_diverged(read_rows(existing[job.name]))))
             else:
                 todo.append(job)
     return Plan(done, todo, refused)
@@ -110,7 +120,7 @@ def _jobs(
     matrix: Matrix, task: str, constraints: Path | None, preset: str, method: str
 ) -> Iterator[Job | Outcome]:
     kind = "rollout" if matrix.rollout else "plan"
-    asked = Request(
+    request = Request(
         task=task,
         method=method,
         preset=preset,
@@ -123,18 +133,17 @@ def _jobs(
     group = (task, stem, method, preset)
     digest, error = "", None
     try:
-        config = resolve(asked).record()
-        decides = {
-            key: value for key, value in config.items() if key not in ("options", "start", "goal")
-        }
+        config = resolve(request).record()
+        left_out = ("options", "start", "goal")
+        decides = {key: value for key, value in config.items() if key not in left_out}
         decides["constraints"] = config["constraints"]["content"]
         decides |= {} if matrix.random else {"pins": (config["start"], config["goal"])}
         text = json.dumps(decides | {"random": matrix.random}, sort_keys=True, default=str)
         digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    except CdiffError as found:
-        error = str(found)
+    except CdiffError as refusal:
+        error = str(refusal)
     for seed in matrix.seeds:
-        options = Request(**(vars(asked) | {"seed": seed}))
+        options = Request(**(vars(request) | {"seed": seed}))
         job = Job(
             options,
             matrix.rollout,
@@ -145,19 +154,7 @@ def _jobs(
 
 
 def _check_names(matrix: Matrix) -> None:
-    for task in matrix.tasks:
-        load_task(task)
-    for method in matrix.methods:
-        if method not in METHODS:
-            raise CdiffError(
-                f'--methods: no method "{method}"{suggestion(method, METHODS)}; choose from {", ".join(METHODS)}'
-            )
-    for task, preset in product(matrix.tasks, matrix.presets):
-        known = load_recipe(task).presets
-        if preset not in known:
-            raise CdiffError(
-                f'--presets: no preset "{preset}"{suggestion(preset, known)}; {task} has {", ".join(known)}'
-            )
+    check_sweep(matrix.tasks, matrix.methods, matrix.presets)
     for path in matrix.constraints:
         if path is not None and not path.exists():
             raise CdiffError(f"--constraints: {path}: no such file")
@@ -170,7 +167,7 @@ def run_jobs(
     backend: str = "local",
     address: str | None = None,
 ) -> Iterator[Outcome]:
-    """Outcomes as they come; a job that fails has its error in its outcome."""
+    """Make the runs and yield outcomes as they come; a failed job has its error in its outcome."""
     from joblib import Parallel, delayed
 
     with _backend(backend, address, workers):
@@ -179,14 +176,13 @@ def run_jobs(
             yield from Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")(runs)
             return
         with Parallel(n_jobs=workers, batch_size=1) as pool:
-            for first in range(
-                0, len(runs), 4 * workers
-            ):  # its joblib backend hands results back all at once alone
+            # Ray's joblib backend returns all results at once: a few jobs at a time show progress
+            for first in range(0, len(runs), 4 * workers):
                 yield from pool(runs[first : first + 4 * workers])
 
 
 def run_job(job: Job, root: Path, folder: Path) -> Outcome:
-    """One run, with `folder` as the working directory, wherever the worker was started."""
+    """Make one run, with `folder` as the working directory wherever the worker was started."""
     from cdiff_cli.commands.plan import plan_run
     from cdiff_cli.commands.rollout import control_run, rollout_run
 
@@ -194,18 +190,15 @@ def run_job(job: Job, root: Path, folder: Path) -> Outcome:
     try:
         with contextlib.chdir(folder), _one_thread():
             resolved = resolve(job.options)
-            execute = control_run if resolved.task.control == "receding_horizon" else rollout_run
+            execute = control_run if resolved.replans else rollout_run
             make = cast(Any, execute if job.rollout else plan_run)
             finished = make(resolved, root, lambda *_: None, name=job.name, pictures=False)
         return Outcome(job, time.perf_counter() - began, diverged=_diverged(finished.rows))
     except CdiffError as error:
         return Outcome(job, time.perf_counter() - began, str(error))
-    except Exception as error:  # whatever it is, it is told at the end, and the other jobs go on
-        return Outcome(
-            job,
-            time.perf_counter() - began,
-            f"{type(error).__name__}: {' '.join(str(error).split())}",
-        )
+    except Exception as error:  # reported at the end; the other jobs go on
+        message = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Outcome(job, time.perf_counter() - began, message)
 
 
 def _diverged(rows: Sequence[Row]) -> bool:
@@ -214,7 +207,7 @@ def _diverged(rows: Sequence[Row]) -> bool:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """The order of additions, and so the last digits, must not depend on the number of cores."""
+    """Work on one thread: the order of additions sets the last digits."""
     import torch
 
     before = torch.get_num_threads()
@@ -227,7 +220,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _backend(name: str, address: str | None, workers: int) -> Iterator[None]:
-    """joblib's processes here, or the cluster at an address by its own joblib backend."""
+    """joblib's local processes, or the cluster at an address by its own joblib backend."""
     from joblib import parallel_config
 
     if name == "ray":
@@ -243,9 +236,8 @@ def _backend(name: str, address: str | None, workers: int) -> Iterator[None]:
                     f"--jobs: the Ray cluster has {cpus} CPUs, one for each job; found {workers}"
                 )
             register_ray()
-            with parallel_config(
-                "ray", ray_remote_args={"num_cpus": 1}
-            ):  # its workers ask for none: one node may get all
+            # without num_cpus one node may get all jobs
+            with parallel_config("ray", ray_remote_args={"num_cpus": 1}):
                 yield
         finally:
             ray.shutdown()
@@ -278,11 +270,9 @@ def _extra(name: str) -> Iterator[None]:
         yield
     except ImportError:
         raise CdiffError(
-            f"--backend {name}: not installed here; install the extra: pip install 'cdiff-cli[{name}]'"
+            f"--backend {name}: not installed here; "
+            f"install the extra: pip install 'cdiff-cli[{name}]'"
         ) from None
-
-
-# progress -------------------------------------------------------------------------------------------------------------
 
 
 def run_sweep(
@@ -293,18 +283,17 @@ def run_sweep(
     backend: str = "local",
     address: str | None = None,
 ) -> list[Outcome]:
-    """Make the missing runs, tell of them on screen (a table, or a line a run where it is no terminal); return those that failed or
-    diverged, which were there included.
+    """Make the missing runs and return those that failed or diverged, older ones included.
+
+    screen   shows a table, or one line per run where it is no terminal
     """
     if workers < 1 or not matrix.seeds:
         raise CdiffError(f"--{'seeds' if workers >= 1 else 'jobs'}: expected at least 1")
-    if backend not in BACKENDS:
-        raise CdiffError(
-            f'--backend: no backend "{backend}"{suggestion(backend, BACKENDS)}; choose from {", ".join(BACKENDS)}'
-        )
+    check_choice("backend", backend, BACKENDS, "--backend")
     if address and backend == "local":
         raise CdiffError(
-            "--address: the runs are local; name the cluster's kind with --backend ray or --backend dask"
+            "--address: the runs are local; "
+            "name the cluster's kind with --backend ray or --backend dask"
         )
     plan = plan_sweep(matrix, root)
     over, began = list(plan.refused), time.monotonic()
@@ -335,31 +324,37 @@ def _size(plan: Plan) -> int:
 
 
 def progress_table(over: Sequence[Outcome], plan: Plan, began: float) -> Table:
-    """A line a group: done, of them diverged, failed, of how many, mean seconds a run made; above it what is left."""
-    made, left = len(over) - len(plan.refused), len(plan.todo) + len(plan.refused) - len(over)
-    eta = f", about {(time.monotonic() - began) * left / made:.0f} s" if made and left else ""
+    """One row per group: runs done, diverged, failed, all, and mean seconds per run made.
+
+    over    refused jobs and those made now
+    began   time.monotonic() when the first run began
+    """
+    completed = len(over) - len(plan.refused)
+    left = len(plan.todo) - completed
+    eta = (
+        f", about {(time.monotonic() - began) * left / completed:.0f} s"
+        if completed and left
+        else ""
+    )
     table = Table(
-        title=f"{len(plan.done)} were there, {made} made, {left} to do{eta}", title_justify="left"
+        title=f"{len(plan.done)} were there, {completed} made, {left} to do{eta}",
+        title_justify="left",
     )
     for heading in ("task", "constraints", "method", "preset"):
         table.add_column(heading)
     for heading in ("done", "diverged", "failed", "of", "s / run"):
         table.add_column(heading, justify="right")
-    every = Counter(
-        job.group for job in (*plan.todo, *(outcome.job for outcome in (*plan.done, *plan.refused)))
-    )
-    there, failed = (
-        Counter(o.job.group for o in plan.done),
-        Counter(o.job.group for o in over if o.error is not None),
-    )
+    jobs = (*plan.todo, *(outcome.job for outcome in (*plan.done, *plan.refused)))
+    older = Counter(outcome.job.group for outcome in plan.done)
+    failed = Counter(outcome.job.group for outcome in over if outcome.error is not None)
     diverged = Counter(outcome.job.group for outcome in (*plan.done, *over) if outcome.diverged)
-    for group, total in every.items():
+    for group, total in Counter(job.group for job in jobs).items():
         took = [
             outcome.seconds
             for outcome in over
             if outcome.job.group == group and outcome.error is None
         ]
         mean = f"{sum(took) / len(took):.1f}" if took else ""
-        counts = (there[group] + len(took), diverged[group], failed[group], total)
+        counts = (older[group] + len(took), diverged[group], failed[group], total)
         table.add_row(*group, *map(str, counts), mean)
     return table

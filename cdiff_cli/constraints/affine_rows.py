@@ -9,11 +9,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class AffineRows:
-    """g(x) = A x + b of trajectories x [batch, horizon, dim], each written as one vector.
+    """g(x) = A x + b, with each trajectory x [batch, horizon, dim] written as one vector.
 
     A      [n, horizon dim]
     b      [batch | 1, n]
-    size   what Constraint.linearise gives for step sizes   [1, n]
+    size   the bound per row that Constraint.linearise returns   [1, n]
     """
 
     A: Tensor
@@ -24,9 +24,12 @@ class AffineRows:
         return torch.addmm(self.b, x.flatten(1), self.A.T)
 
     def linearise(self, x: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
-        """As Constraint.linearise."""
+        """The values, the pull and the bounds, as Constraint.linearise returns them."""
         return self(x), lambda w: (w @ self.A).view(-1, *x.shape[1:]), self.size
 
     def about(self, centre: Tensor, like: Tensor) -> "AffineRows":
-        """The same rows of y, x = centre + y, in the dtype and on the device of `like`   centre [batch, horizon, dim]"""
+        """The rows as a function of y, x = centre + y, in the dtype and on the device of `like`.
+
+        centre   [batch, horizon, dim]
+        """
         return AffineRows(self.A.to(like), self(centre).to(like), self.size.to(like))

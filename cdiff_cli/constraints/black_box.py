@@ -1,6 +1,6 @@
-"""Constraint rows of which nothing but the function is known."""
+"""Constraint rows that are known only as a function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -8,17 +8,21 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import selected
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import selected
 from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 
 
 @dataclass(frozen=True)
 class BlackBox:
-    """Rows of which only the function is known: differentiated by autograd, projected by sequential linearisation.
+    """Rows that are known only as a function.
+
+    They are differentiated by autograd and projected by sequential quadratic programming.
 
     fn             trajectory in environment units -> rows, differentiable
-    count          number of rows at a horizon
-    centre, scale  of the trajectories it is applied to, where they are not in environment units: those are centre + scale * x
+    count          horizon -> number of rows
+    margin         added to the rows, their units
+    centre, scale  the trajectories that fn takes are centre + scale * x; None: x itself   [dim]
     """
 
     name: str
@@ -29,8 +33,11 @@ class BlackBox:
     scale: Tensor | None = None
 
     trailing: ClassVar = {"centre": 1, "scale": 1}
+    level = None
+    support = 0
     spans = True
     affine = False
+    exact_on_segments = False
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{i}" for i in range(self.count(horizon))]
@@ -70,9 +77,22 @@ class BlackBox:
     def segment_max(self, x: Traj) -> Rows:
         return self(x)
 
+    def segment_argmax(self, x: Traj) -> None:
+        return None
+
     def state_values(self, x: Traj) -> Rows:
         return self(x).amax(1, keepdim=True).expand(x.shape[:2])
 
     def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
-        """Nothing is known of it between the waypoints."""
+        """The part itself: nothing is known of its rows between waypoints."""
         return (self,)
+
+    def coordinates(self, dim: int) -> list[int]:
+        return list(range(dim))
+
+    def restrict(self, columns: Sequence[int]) -> "BlackBox":
+        """The part itself, because `columns` are all coordinates."""
+        return self
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        """Pins are not checked: no row is known to depend on pinned waypoints alone."""

@@ -1,10 +1,11 @@
-"""Linear dynamics with bounded inputs: what they make, their rows, fitting them.
+"""Linear dynamics with bounded inputs.
 
     x^{tau+1} = A x^tau + B u^tau + c,   low <= u <= high
 
-The nearest trajectory that they make is found in projection/dynamics.py.
+projection/dynamics.py finds the nearest trajectory that satisfies them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -12,13 +13,14 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj, each_end
-from cdiff_cli.constraints.state_sets import selected
-from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import selected
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint, check_fixed_rows
 
 
 @dataclass(frozen=True)
 class LinearDynamics:
-    """x' = A x + B u + c with low <= u <= high.
+    """x' = A x + B u + c with low <= u <= high, in environment units.
 
     A [n, n], B [n, m], c [n], low, high [m]
     """
@@ -36,33 +38,36 @@ class LinearDynamics:
         return LinearDynamics(*(v.to(like) for v in (self.A, self.B, self.c, self.low, self.high)))
 
     def rollout(self, x0: Tensor, u: Tensor) -> Traj:
-        """States from x0 [batch, n] under the inputs u [batch, horizon - 1, m]: [batch, horizon, n]."""
+        """The states [batch, horizon, n] from x0 [batch, n] under u [batch, horizon - 1, m]."""
         x, power, reach = torch.cat((x0[:, None], u @ self.B.T + self.c), 1), self.A, 1
-        while reach < x.shape[1]:  # each state then holds what its last `reach` steps contribute
+        while reach < x.shape[1]:  # x holds the contribution of the last `reach` steps per state
             x = torch.cat((x[:, :reach], x[:, reach:] + x[:, :-reach] @ power.T), 1)
             power, reach = power @ power, 2 * reach
         return x
 
-    def wanted(self, x: Traj) -> Tensor:
-        """The inputs that come closest to producing x, whatever their size [batch, horizon - 1, m]."""
+    def unbounded_inputs(self, x: Traj) -> Tensor:
+        """The inputs that come closest to producing x, without bounds [batch, horizon - 1, m]."""
         return (x[:, 1:] - x[:, :-1] @ self.A.T - self.c) @ torch.linalg.pinv(self.B).T
 
     def inputs(self, x: Traj) -> Tensor:
-        """The same, cut to the inputs' bounds."""
-        return torch.clamp(self.wanted(x), self.low, self.high)
+        """The inputs that come closest to producing x, clamped to their bounds."""
+        return torch.clamp(self.unbounded_inputs(x), self.low, self.high)
 
     def residual(self, x: Traj) -> Tensor:
-        """|x' - A x - B u - c| of each step under those inputs [batch, horizon - 1]."""
+        """|x' - A x - B u - c| per step, u = inputs(x) [batch, horizon - 1]."""
         return (x[:, 1:] - self(x[:, :-1], self.inputs(x))).norm(dim=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class LinearDynamicsConstraint:
-    """Each step is one that the dynamics can make: |x' - A x - B u - c| <= tolerance for some u within its bounds. A row a step.
+    """Each step satisfies the dynamics: |x' - A x - B u - c| <= tolerance for some u within bounds.
+
+    One row per step.
 
     dynamics       environment units
-    centre, scale  of the trajectories it is applied to: x = centre + scale * z   [n]
-    weight         of each coordinate in the distance of its projection, environment units   [n]
+    centre, scale  the trajectories z that it is applied to are x = centre + scale * z        [n]
+    weight         weight per coordinate in the distance of the projection, environment units [n]
+    tolerance      environment units
     """
 
     name: str
@@ -73,14 +78,17 @@ class LinearDynamicsConstraint:
     tolerance: float
 
     trailing: ClassVar = {"centre": 1, "scale": 1}
-    spans = False  # between two states there is nothing to obey
+    level = None
+    support = 2
+    spans = False  # dynamics restrict the waypoints alone
     affine = False  # rows are absolute values
+    exact_on_segments = True
 
     @classmethod
     def from_dynamics(
         cls, name: str, dynamics: LinearDynamics, tolerance: float
     ) -> "LinearDynamicsConstraint":
-        """Of trajectories in environment units, every coordinate weighing 1."""
+        """The constraint in environment units, with weight 1 for every coordinate."""
         one = torch.ones_like(dynamics.c)
         return cls(name, dynamics, torch.zeros_like(one), one, one, tolerance)
 
@@ -130,8 +138,11 @@ class LinearDynamicsConstraint:
     tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
-        """A step's own row."""
+        """The row of each step."""
         return self(x)
+
+    def segment_argmax(self, x: Traj) -> None:
+        return None
 
     def state_values(self, x: Traj) -> Rows:
         return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
@@ -139,17 +150,36 @@ class LinearDynamicsConstraint:
     def on_segments(self) -> tuple[TrajectoryConstraint, ...]:
         return (self,)
 
+    def coordinates(self, dim: int) -> list[int]:
+        return list(range(dim))
+
+    def restrict(self, columns: Sequence[int]) -> "LinearDynamicsConstraint":
+        """The part itself, because `columns` are all coordinates."""
+        return self
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        check_fixed_rows(self, pins, tolerance)
+
 
 def dynamics_of(g: Constraint) -> list[LinearDynamicsConstraint]:
-    """The parts that ask for dynamics to be obeyed."""
+    """The parts of g that are dynamics."""
     return [part for part in g.parts if isinstance(part, LinearDynamicsConstraint)]
 
 
 def split(g: Constraint) -> tuple[Constraint, Constraint]:
     """g without its dynamics, and its dynamics alone."""
-    found = dynamics_of(g)
-    if not found:
+    dynamics = dynamics_of(g)
+    if not dynamics:
         return g, Constraint(())
-    return Constraint(tuple(part for part in g.parts if part not in found)), Constraint(
-        tuple(found)
+    others = tuple(part for part in g.parts if part not in dynamics)
+    return Constraint(others), Constraint(tuple(dynamics))
+
+
+def weighted(g: Constraint, weight: Tensor) -> Constraint:
+    """g with a weight per coordinate [n] in the distance of every projection onto its dynamics."""
+    return Constraint(
+        tuple(
+            replace(part, weight=weight) if isinstance(part, LinearDynamicsConstraint) else part
+            for part in g.parts
+        )
     )

@@ -1,5 +1,6 @@
-"""The barrier of a ball that is approached: distance and its rate of change together, for inputs that are forces."""
+"""The second-order control barrier function of a ball, for inputs that are forces."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -7,21 +8,24 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import times
-from cdiff_cli.constraints.state_sets import Ellipsoid, SegmentPoints
+from cdiff_cli.constraints.protocol import SegmentPoints, worse_end
+from cdiff_cli.constraints.state_sets import Ellipsoid
 
-NEAREST = 1e-9  # of a distance to the centre, so that the centre itself has a normal
+LEAST_DISTANCE = 1e-9  # [m] smallest distance to the centre; gives the centre itself a normal
 
 
 @dataclass(frozen=True)
 class BallHOCBF:
-    """f = -psi,  psi = h + time dh/dt,  h = |y| - radius  with y = which x - centre, and dh/dt = (y / |y|).w, w = rates x - drift.
+    """f = -psi with psi = h + time dh/dt, the high-order control barrier function of a ball.
 
-    psi >= 0 all along gives h(t) >= h(0) e^(-t / time): a path that starts outside never enters (a control barrier function of
-    relative degree 2; Xiao and Belta, 2019). One waypoint's positions and velocities decide it, and an input that is a force
-    moves it at once, where h alone answers only steps later.
+        h = |y| - radius,  y = which x - centre,   dh/dt = (y / |y|).w,  w = rates x - drift
 
-    which, centre   relative position in metres      [k, dim], [k]
-    rates, drift    relative velocity in metres a second   [k, dim], [k]
+    A path with psi >= 0 has h(t) >= h(0) e^(-t / time), so a path that starts outside never enters.
+    The relative degree is 2 (Xiao and Belta, 2019): psi depends on the velocity of one waypoint, so
+    a force changes psi within one step, whereas it changes h only steps later.
+
+    which, centre   relative position in metres                [k, dim], [k]
+    rates, drift    relative velocity in metres per second     [k, dim], [k]
     radius          metres
     time            seconds
     """
@@ -41,9 +45,9 @@ class BallHOCBF:
         return self.radius - length - self.time * closing
 
     def _sight(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """|y|, y / |y|, w and w along the line of sight, (y / |y|).w."""
+        """|y|, y / |y|, w, and w along the line of sight (y / |y|).w."""
         y = times(x, self.which.mT) - self.centre
-        length = torch.linalg.vector_norm(y, dim=-1).clamp_min(NEAREST)
+        length = torch.linalg.vector_norm(y, dim=-1).clamp_min(LEAST_DISTANCE)
         normal, rate = y / length[..., None], times(x, self.rates.mT) - self.drift
         return length, normal, rate, (normal * rate).sum(-1)
 
@@ -70,9 +74,14 @@ class BallHOCBF:
         return replace(self, radius=self.radius + margin)
 
     def segment_argmax(self, x: Tensor) -> Tensor:
-        """The worse end of each segment: nothing more is known of it between them."""
-        f = self(x)
-        return (f[..., 1:] > f[..., :-1]).to(x)
+        """The worse end of each segment: the largest value in between is not known."""
+        return worse_end(self(x), x)
+
+    def coordinates(self) -> list[int]:
+        return list(range(self.which.shape[-1]))
+
+    def restrict(self, columns: Sequence[int]) -> "BallHOCBF":
+        return replace(self, which=self.which[..., columns], rates=self.rates[..., columns])
 
     def on_segment(self, x: Tensor, s: Tensor) -> SegmentPoints:
         f, slope = self(x), self.gradient(x)
@@ -85,11 +94,12 @@ class BallHOCBF:
         )
 
 
-def second_order(ball: Ellipsoid, later: Tensor, led: Tensor, time: float) -> BallHOCBF:
-    """The barrier of a ball that states keep outside of.
+def second_order(ball: Ellipsoid, later: Tensor, matrix: Tensor, time: float) -> BallHOCBF:
+    """The second-order barrier of a ball whose outside is allowed.
 
-    later   where its centre will be `time` seconds on    [..., k]
-    led     the state `time` seconds on is led x          [dim, dim]
+    later    centre of the ball after `time` seconds                [..., k]
+    matrix   the state after `time` seconds is matrix x             [dim, dim]
     """
-    rates = ball.which @ (led - torch.eye(len(led), dtype=led.dtype, device=led.device)) / time
+    one = torch.eye(len(matrix), dtype=matrix.dtype, device=matrix.device)
+    rates = ball.which @ (matrix - one) / time
     return BallHOCBF(ball.which, ball.centre, rates, (later - ball.centre) / time, ball.m, time)

@@ -1,4 +1,4 @@
-"""Constraints whose numbers are observed while acting: what they are bound to at each control step, and parts that wait for it."""
+"""Constraints whose parameters are observed in closed loop, and bound at each control step."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,21 +8,22 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import StateSet
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import StateSet
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.errors import CdiffError
 
 ObservedValues = Mapping[str, Tensor]
-"""Observed quantities by name, each [batch]."""
+"""Observed quantities per name, each [batch]."""
 
 
 @dataclass(frozen=True)
 class Observed:
-    """A part that is known once its quantities are observed: bind makes it.
+    """A part that is known once its quantities are observed; `bind` then returns it.
 
     names    the quantities
-    make     observed quantities, seconds between waypoints, horizon -> the part, environment units
-    changes  what was asked of the part before it was known, in order
+    make     (observed quantities, seconds between waypoints, horizon) -> the part
+    changes  operations on the part that bind applies in order, such as pull_back and tighten
     """
 
     name: str
@@ -30,18 +31,22 @@ class Observed:
     make: Callable[[ObservedValues, float, int], TrajectoryConstraint]
     changes: tuple[Callable[[TrajectoryConstraint], Sequence[TrajectoryConstraint]], ...] = ()
 
+    level = None
+    support = 0
     spans = True
     affine = False
+    exact_on_segments = False
 
     def bind(
         self, observed: ObservedValues, dt: float, horizon: int
     ) -> tuple[TrajectoryConstraint, ...]:
-        """The part, filled in; CdiffError where a quantity is missing."""
+        """The part for these observations; raises CdiffError where a quantity is missing."""
         missing = [name for name in self.names if name not in observed]
         if missing:
             offered = ", ".join(observed) or "nothing"
             raise CdiffError(
-                f'the constraint "{self.name}" observes {", ".join(missing)}; what is observed here is {offered}'
+                f'the constraint "{self.name}" observes {", ".join(missing)}; what is observed here'
+                f" is {offered}"
             )
         parts: Sequence[TrajectoryConstraint] = (self.make(observed, dt, horizon),)
         for change in self.changes:
@@ -49,10 +54,9 @@ class Observed:
         return tuple(parts)
 
     def example(self, horizon: int) -> tuple[TrajectoryConstraint, ...]:
-        """The part as it is where every quantity is 1: its form, not its numbers."""
-        return self.bind(
-            {name: torch.ones(1, dtype=torch.float64) for name in self.names}, 1.0, horizon
-        )
+        """The part with 1 for every quantity: its form, not its parameters."""
+        ones = {name: torch.ones(1, dtype=torch.float64) for name in self.names}
+        return self.bind(ones, 1.0, horizon)
 
     def labels(self, horizon: int) -> list[str]:
         return [label for part in self.example(horizon) for label in part.labels(horizon)]
@@ -75,6 +79,15 @@ class Observed:
     def on_segments(self) -> "tuple[Observed, ...]":
         return (self._then(lambda part: part.on_segments()),)
 
+    def coordinates(self, dim: int) -> list[int]:
+        return list(range(dim))
+
+    def restrict(self, columns: Sequence[int]) -> "Observed":
+        return self._then(lambda part: (part.restrict(columns),))
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        """Pins are not checked before the quantities are observed."""
+
     def _then(
         self, change: Callable[[TrajectoryConstraint], Sequence[TrajectoryConstraint]]
     ) -> "Observed":
@@ -89,18 +102,22 @@ class Observed:
     def segment_max(self, x: Traj) -> Rows:
         self.refuse()
 
+    def segment_argmax(self, x: Traj) -> None:
+        self.refuse()
+
     def state_values(self, x: Traj) -> Rows:
         self.refuse()
 
     def refuse(self) -> NoReturn:
         """Raise the CdiffError that says why this part has no values."""
         raise CdiffError(
-            f'the constraint "{self.name}" observes {", ".join(self.names)}, which is known only while acting: use `cdiff rollout`'
+            f'the constraint "{self.name}" observes {", ".join(self.names)}, which is known only'
+            " while acting: use `cdiff rollout`"
         )
 
 
 def require_bound(g: Constraint) -> None:
-    """Refuse a constraint that waits for what only acting observes; raises CdiffError."""
+    """Raise CdiffError if a part of g waits for observed quantities."""
     for part in g.parts:
         if isinstance(part, Observed):
             part.refuse()
@@ -109,6 +126,9 @@ def require_bound(g: Constraint) -> None:
 def carried(
     level: StateSet, velocity: Tensor, dt: float, horizon: int, ahead: float = 0.0
 ) -> StateSet:
-    """The level moving at a velocity [dim] or [batch, 1, dim]: at waypoint k it stands where k dt + ahead of it have brought it."""
-    way = velocity * (ahead + dt * torch.arange(horizon, dtype=velocity.dtype))[:, None]
-    return level.pull_back(-way, velocity.new_ones(velocity.shape[-1]))
+    """The set moving at a constant velocity: at waypoint k it has moved for k dt + ahead seconds.
+
+    velocity   [dim] or [batch, 1, dim], environment units per second
+    """
+    offset = velocity * (ahead + dt * torch.arange(horizon, dtype=velocity.dtype))[:, None]
+    return level.pull_back(-offset, velocity.new_ones(velocity.shape[-1]))

@@ -1,4 +1,4 @@
-"""Coordinates whose values are given: the start, the goal."""
+"""Coordinates of a trajectory that are fixed, such as the start and the goal."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cdiff_cli.arrays import Traj
+from cdiff_cli.arrays import Array, Traj
 
 
 @dataclass(frozen=True)
 class Pins:
-    """Coordinates whose values are given: the start, the goal.
+    """Coordinates of a trajectory that are fixed.
 
-    mask     True where fixed             [horizon, dim]
-    values   what they are fixed to       [batch, horizon, dim]
+    mask     True where fixed                                  [horizon, dim]
+    values   the fixed values; ignored where mask is False     [batch, horizon, dim]
     """
 
     mask: Bool[Tensor, "horizon dim"]
@@ -23,7 +23,7 @@ class Pins:
 
     @cached_property
     def whole(self) -> bool:
-        """Whether each waypoint is fixed as a whole or not at all."""
+        """Whether every waypoint is fixed as a whole or not at all."""
         return bool((self.mask.all(1) == self.held).all())
 
     @cached_property
@@ -33,25 +33,30 @@ class Pins:
 
     @cached_property
     def loose(self) -> tuple[int, int]:
-        """The first waypoint that is not held, and the one after the last."""
+        """The first waypoint without a fixed coordinate, and the index after the last one."""
         free = [tau for tau, held in enumerate(self.held.tolist()) if not held]
         return (free[0], free[-1] + 1) if free else (0, 0)
 
     @classmethod
     def none(cls, like: Traj) -> "Pins":
+        """Nothing is fixed."""
         return cls(torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device), like)
 
     @classmethod
-    def ends(cls, x: Traj) -> "Pins":
-        """The first and the last state of each trajectory are fixed at their values in x."""
+    def ends(cls, x: Traj | Array) -> "Pins":
+        """The first and the last state of each trajectory are fixed at their values in x.
+
+        x   [batch, horizon, dim], numpy or torch
+        """
+        x = torch.as_tensor(x)
         mask = torch.zeros(x.shape[1:], dtype=torch.bool, device=x.device)
         mask[[0, -1]] = True
         return cls(mask, x)
 
     def paint(self, x: Traj) -> Traj:
-        """x with the pinned coordinates set."""
+        """x with the pinned coordinates at their values."""
         return torch.where(self.mask, self.values.to(x), x)
 
     def free(self, direction: Traj) -> Traj:
-        """A direction that leaves the pinned coordinates alone."""
+        """The direction with 0 at the pinned coordinates."""
         return torch.where(self.mask, 0.0, direction)

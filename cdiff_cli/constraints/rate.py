@@ -1,6 +1,7 @@
 """Limits on how fast coordinates change between waypoints.
 
-The rate of a segment is (x^{tau+1} - x^tau) / dt: on a straight segment the same all along, so one row per segment says it exactly.
+The rate on a segment is (x^{tau+1} - x^tau) / dt. It is constant along a straight segment, so one
+row per segment is exact.
 """
 
 import math
@@ -14,19 +15,22 @@ from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj, each_end
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.state_sets import selected
-from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.constraints.protocol import nonzero_columns, selected
+from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.errors import InfeasibleError
 
 
 @dataclass(frozen=True, eq=False)
 class RateLimit:
-    """A limit on the rate of change of some coordinates from each waypoint to the next. A row a segment, in their units a second.
+    """A limit on the rate of change of some coordinates from each waypoint to the next.
 
-    norm           whether g = |rate| - high, else g = max(rate - high, low - rate) of a single coordinate
-    which          selects the coordinates                                          [k, dim]
-    centre, scale  of the trajectories it is applied to: x = centre + scale * z     [dim]
+    One row per segment, in the units of the coordinates per second.
+
+    which          selects the coordinates                                             [k, dim]
+    low, high      limits, units of the coordinates per second
+    norm           g = |rate| - high; if False g = max(rate - high, low - rate) of one coordinate
     dt             seconds between waypoints
+    centre, scale  the trajectories z that it is applied to are x = centre + scale * z   [dim]
     """
 
     name: str
@@ -39,19 +43,22 @@ class RateLimit:
     scale: Tensor
 
     trailing: ClassVar = {"which": 2, "centre": 1, "scale": 1}
+    level = None
+    support = 2
     spans = True
-    affine = False  # a row has two sides
+    affine = False  # a row is the larger of two sides
+    exact_on_segments = True
 
     def labels(self, horizon: int) -> list[str]:
         return [f"{self.name}@{tau}-{tau + 1}" for tau in range(horizon - 1)]
 
-    def selected(self, x: Traj) -> Tensor:
-        """The coordinates it limits, in environment units [batch, horizon, k]."""
+    def limited(self, x: Traj) -> Tensor:
+        """The limited coordinates, in environment units [batch, horizon, k]."""
         return (self.centre + self.scale * x) @ self.which.T
 
     def rates(self, x: Traj) -> Tensor:
-        """[batch, horizon - 1, k]"""
-        p = self.selected(x)
+        """The rates of the limited coordinates [batch, horizon - 1, k]."""
+        p = self.limited(x)
         return (p[:, 1:] - p[:, :-1]) / self.dt
 
     def __call__(self, x: Traj) -> Rows:
@@ -93,15 +100,20 @@ class RateLimit:
         low, high = self.low + margin, self.high - margin
         if high < (0.0 if self.norm else low):
             raise InfeasibleError(
-                f'no rate of change is {margin:g} within the limits of "{self.name}"; relax one of them'
+                f'no rate of change is {margin:g} within the limits of "{self.name}"; relax one of'
+                " them"
             )
         return replace(self, low=low, high=high)
 
     tighten_level = tighten
 
     def segment_max(self, x: Traj) -> Rows:
-        """A segment's own row: along it the rate does not change."""
+        """The row of each segment, along which the rate is constant."""
         return self(x)
+
+    def segment_argmax(self, x: Traj) -> Rows:
+        """0: the rate is the same at every point, and the first one is named."""
+        return x.new_zeros(len(x), x.shape[1] - 1)
 
     def state_values(self, x: Traj) -> Rows:
         return torch.nn.functional.pad(self(x), (1, 0), value=-torch.inf)
@@ -109,56 +121,81 @@ class RateLimit:
     def on_segments(self) -> tuple[TrajectoryConstraint, ...]:
         return (self,)
 
-    def cut(self, change: Tensor) -> Tensor:
-        """Changes from waypoint to waypoint [k, ...] brought within the limit."""
+    def coordinates(self, dim: int) -> list[int]:
+        return nonzero_columns(self.which)
+
+    def restrict(self, columns: Sequence[int]) -> "RateLimit":
+        parameters = {name: getattr(self, name)[..., columns] for name in self.trailing}
+        return replace(self, **parameters)
+
+    def nearest_change(self, change: Tensor) -> Tensor:
+        """The nearest changes between waypoints [k, ...] within the limit, environment units."""
         if self.norm:
             length = change.norm(dim=0, keepdim=True)
             return change * (self.high * self.dt / length.clamp_min(1e-30)).clamp_max(1.0)
         return change.clamp(self.low * self.dt, self.high * self.dt)
 
-    def refuse_pins(self, pins: Pins, tolerance: float) -> None:
-        """Pinned waypoints too far apart for the time between them can never be joined."""
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        """Raise InfeasibleError for pinned waypoints too far apart for the time between them."""
         held = pins.mask[:, (self.which != 0).any(0)].all(1).nonzero()[:, 0].tolist()
-        p = self.selected(pins.values)
+        p = self.limited(pins.values)
         for first, last in pairwise(held):
             needed = (p[:, last] - p[:, first]) / ((last - first) * self.dt)
             over = self._excess(needed[:, None])
             if bool((over > tolerance).any()):
                 worst = needed[int(over[:, 0].argmax())]
-                asked = float(worst.norm()) if self.norm else float(worst[0])
-                limit = self.low if not self.norm and asked < self.low else self.high
+                rate = float(worst.norm()) if self.norm else float(worst[0])
+                limit = self.low if not self.norm and rate < self.low else self.high
                 raise InfeasibleError(
-                    f'"{self.name}" excludes the pinned waypoints {first} and {last}: from one to the other in '
-                    f"{(last - first) * self.dt:g} s takes a mean rate of {asked:.3g} a second, the limit is {limit:g}; "
-                    "move the start or goal, or relax the limit"
+                    f'"{self.name}" excludes the pinned waypoints {first} and {last}: from one to'
+                    f" the other in {(last - first) * self.dt:g} s takes a mean rate of"
+                    f" {rate:.3g} per second, the limit is {limit:g}; move the start or goal, or"
+                    " relax the limit"
                 )
 
 
-def refuse_contradiction(parts: Sequence[RateLimit]) -> None:
-    """Limits that no change meets together: of each coordinate the slowest change that those of it alone allow is the easiest for
-    the limits of lengths.
+def limits_of(g: Constraint) -> list[RateLimit]:
+    """The parts of g that limit rates."""
+    return [part for part in g.parts if isinstance(part, RateLimit)]
+
+
+def max_rate(g: Constraint, columns: set[int]) -> float:
+    """The largest length of the rate of these coordinates that g allows; inf without a limit."""
+    limits = [
+        part.high
+        for part in limits_of(g)
+        if part.norm and set(part.which.argmax(1).tolist()) == columns
+    ]
+    return min(limits, default=math.inf)
+
+
+def check_rates(g: Constraint) -> None:
+    """Raise InfeasibleError for rate limits that no rate of change satisfies together.
+
+    Per coordinate, the slowest rate that its limits allow is the easiest one for limits on lengths.
     """
-    forced: dict[int, tuple[float, str]] = {}
-    alone = [part for part in parts if not part.norm]
-    for column in sorted({int(part.which[0].argmax()) for part in alone}):
-        mine = [part for part in alone if int(part.which[0].argmax()) == column]
-        least, most = max(mine, key=lambda part: part.low), min(mine, key=lambda part: part.high)
+    limits = limits_of(g)
+    slowest: dict[int, tuple[float, str]] = {}
+    single = [part for part in limits if not part.norm]
+    for column in sorted({int(part.which[0].argmax()) for part in single}):
+        same = [part for part in single if int(part.which[0].argmax()) == column]
+        least, most = max(same, key=lambda part: part.low), min(same, key=lambda part: part.high)
         if least.low > most.high:
-            _contradict(least.name, most.name)
-        slowest = least if least.low > 0 else most
-        forced[column] = (min(max(0.0, least.low), most.high), slowest.name)
-    for part in parts:
-        met = [forced[c] for c in part.which.argmax(1).tolist() if c in forced]
-        if part.norm and math.hypot(*(rate for rate, _ in met)) > part.high:
-            _contradict(part.name, max(met, key=lambda one: abs(one[0]))[1])
+            raise _contradiction(least.name, most.name)
+        binding = least if least.low > 0 else most
+        slowest[column] = (min(max(0.0, least.low), most.high), binding.name)
+    for part in limits:
+        forced = [slowest[c] for c in part.which.argmax(1).tolist() if c in slowest]
+        if part.norm and math.hypot(*(rate for rate, _ in forced)) > part.high:
+            raise _contradiction(part.name, max(forced, key=lambda one: abs(one[0]))[1])
 
 
-def _contradict(one: str, other: str) -> None:
-    raise InfeasibleError(
+def _contradiction(one: str, other: str) -> InfeasibleError:
+    return InfeasibleError(
         f'no rate of change is within the limits of both "{one}" and "{other}"; relax one of them'
     )
 
 
 def rate_bounds(low: float | None, high: float | None) -> tuple[float, float]:
-    """Bounds, infinite where not given."""
+    """The bounds, infinite where not given."""
     return (-math.inf if low is None else low), (math.inf if high is None else high)

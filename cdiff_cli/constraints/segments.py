@@ -1,30 +1,31 @@
 """A state constraint that holds all along the straight segments between waypoints."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
-from cdiff_cli.constraints.state_sets import (
-    Quadric,
-    QuadricInFrame,
-    StateSet,
-    converted,
-    segment_max,
-    selected,
-)
-from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import StateSet, converted, segment_max, selected
+from cdiff_cli.constraints.state_sets import as_ellipsoid
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint, check_fixed_rows
 
 
 @dataclass(frozen=True)
 class OnSegments:
-    """f <= 0 all along the straight segments between waypoints: one row a segment, its largest f."""
+    """f <= 0 all along the straight segments between waypoints.
+
+    One row per segment: the largest f on it.
+    """
 
     name: str
     level: StateSet
 
+    support = 2
     spans = True
+    exact_on_segments = True
     affine = False
 
     def labels(self, horizon: int) -> list[str]:
@@ -61,14 +62,25 @@ class OnSegments:
     def segment_max(self, x: Traj) -> Rows:
         return segment_max(self.level, x) if x.shape[1] > 1 else self.level(x)
 
+    def segment_argmax(self, x: Traj) -> Rows:
+        return self.level.segment_argmax(x)
+
     def state_values(self, x: Traj) -> Rows:
         return self.level(x)
 
     def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         return (self,)
 
+    def coordinates(self, dim: int) -> list[int]:
+        return self.level.coordinates()
+
+    def restrict(self, columns: Sequence[int]) -> "OnSegments":
+        return replace(self, level=self.level.restrict(columns))
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        check_fixed_rows(self, pins, tolerance)
+
 
 def keep_on_segments(name: str, level: StateSet) -> OnSegments:
-    """The level on the segments; a quadric that is the outside of a ball or ellipsoid as such, which has an exact form there."""
-    ball = level.ball() if isinstance(level, Quadric | QuadricInFrame) else None
-    return OnSegments(name, ball or level)
+    """The set on the segments, as an Ellipsoid where it is the outside of one."""
+    return OnSegments(name, as_ellipsoid(level))

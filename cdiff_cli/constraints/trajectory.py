@@ -1,8 +1,9 @@
 """Constraints g(x) <= 0 on trajectories, row by row.
 
-A constraint is a tuple of parts. A part applies a state set (a scalar function f of one state, allowed where f <= 0) to the
-trajectory: at every waypoint, on the segments, or as a discrete control barrier function along it. Gradients are written out, so
-that a method pays for a few vector operations and no autograd graph.
+A constraint is a tuple of parts. A part applies a state set to the trajectory: at every waypoint,
+on the segments, or as a discrete control barrier function along it. Other parts limit rates of
+change or require linear dynamics. Gradients are written out, so that a method pays for a few vector
+operations and no autograd graph.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,66 +12,117 @@ from functools import cached_property
 from typing import Protocol, Self, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cdiff_cli.arrays import Pull, Rows, Traj
+from cdiff_cli.arrays import Array, Pull, Rows, Traj
 from cdiff_cli.constraints.affine_rows import AffineRows
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import StateSet
+from cdiff_cli.errors import InfeasibleError
 
 
 class TrajectoryConstraint(Protocol):
-    """Some rows of a constraint."""
+    """Some rows of a constraint, and what a caller may ask about them."""
 
     @property
     def name(self) -> str: ...
     @property
+    def level(self) -> StateSet | None:
+        """The state set that the constraint is about; None where there is none."""
+        ...
+
+    @property
+    def support(self) -> int:
+        """Number of consecutive waypoints per row: row k uses the waypoints k to k + support - 1.
+
+        0 where this is not known.
+        """
+        ...
+
+    @property
     def spans(self) -> bool:
-        """Whether it asks anything of the segments between waypoints; one that does not is as safe there as at them."""
+        """Whether it restricts the segments between waypoints, and not the waypoints alone."""
         ...
 
     @property
     def affine(self) -> bool:
-        """Whether the rows are affine in the trajectory, the same for every plan."""
+        """Whether the rows are affine in the trajectory and the same for every plan."""
+        ...
+
+    @property
+    def exact_on_segments(self) -> bool:
+        """Whether segment_max is the exact maximum, so that a value <= 0 proves a segment safe."""
         ...
 
     def labels(self, horizon: int) -> list[str]: ...
     def __call__(self, x: Traj) -> Rows: ...
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        """g(x); w -> w^T dg/dx; and per row a bound of |dg/dx|^2 that counts the rows it shares coordinates with."""
+        """g(x); the pull w -> w^T dg/dx; and per row a bound of |dg/dx|^2.
+
+        The bound counts the rows that share coordinates with the row.
+        """
         ...
 
     def pull_back(self, centre: Tensor, scale: Tensor) -> Self:
-        """The same part of z, x = centre + scale * z; the rows keep their values and units."""
+        """The same part as a function of z, x = centre + scale * z; the rows keep their units."""
         ...
 
     def select(self, which: Tensor) -> Self:
-        """The same part of some plans of the batch alone."""
+        """The same part for some plans of the batch alone."""
         ...
 
     def to(self, like: Tensor) -> Self:
-        """The same part with its numbers in the dtype and on the device of `like`."""
+        """The same part with its parameters in the dtype and on the device of `like`."""
         ...
 
     def tighten(self, margin: float) -> Self:
-        """g <= -margin."""
+        """The part g <= -margin."""
         ...
 
     def tighten_level(self, margin: float) -> Self:
-        """The level tightened to f <= -margin, a barrier to h >= margin; of a part without a level, g."""
+        """The part with its state set tightened to f <= -margin, which is h >= margin of a barrier.
+
+        A part without a state set is tightened to g <= -margin.
+        """
         ...
 
     def segment_max(self, x: Traj) -> Rows:
         """The largest unsafe value on the segments between waypoints [batch, horizon - 1]."""
         ...
 
+    def segment_argmax(self, x: Traj) -> Rows | None:
+        """The share of each segment before the point of segment_max [batch, horizon - 1].
+
+        None where segment_max belongs to no point of the segment.
+        """
+        ...
+
     def state_values(self, x: Traj) -> Rows:
-        """One value per state [batch, horizon], unsafe above 0: the level, -h of a barrier; of what joins states, the row that
-        ends there; of anything else, the plan's largest row.
+        """One value per state [batch, horizon], unsafe above 0.
+
+        f of the state set (-h of a barrier). A part that joins states gives each state the row that
+        ends there; any other part gives every state the largest row of the plan.
         """
         ...
 
     def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
-        """The parts that hold all along the segments, as far as the part's form allows; itself where they need no more."""
+        """The parts that hold all along the segments, as far as the form of this part allows."""
+        ...
+
+    def coordinates(self, dim: int) -> list[int]:
+        """The coordinates that the rows depend on, of states [dim]."""
+        ...
+
+    def restrict(self, columns: Sequence[int]) -> Self:
+        """The same part of trajectories that have the coordinates `columns` alone.
+
+        columns   indices that include all of coordinates()
+        """
+        ...
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        """Raise InfeasibleError where the pinned waypoints alone violate a row by the tolerance."""
         ...
 
 
@@ -78,16 +130,19 @@ class TrajectoryConstraint(Protocol):
 class Bindable(Protocol):
     """A part that waits for observed quantities (observed.py)."""
 
+    @property
+    def names(self) -> tuple[str, ...]: ...
     def bind(
         self, observed: Mapping[str, Tensor], dt: float, horizon: int
     ) -> tuple[TrajectoryConstraint, ...]: ...
+    def example(self, horizon: int) -> tuple[TrajectoryConstraint, ...]: ...
 
 
 @dataclass(frozen=True)
 class Constraint:
     """g(x) <= 0, row by row: a tuple of parts, each in environment units or all pulled back.
 
-    condensed   the rows of all parts at once, where they are affine and someone has written them so (`condense`)
+    condensed   the rows of all parts as one matrix (`condense`), where they are affine
     """
 
     parts: tuple[TrajectoryConstraint, ...]
@@ -98,8 +153,18 @@ class Constraint:
         """Whether a part waits for observed quantities."""
         return any(isinstance(part, Bindable) for part in self.parts)
 
+    @cached_property
+    def observes(self) -> frozenset[str]:
+        """The names of the quantities that the parts wait for."""
+        waiting = (part.names for part in self.parts if isinstance(part, Bindable))
+        return frozenset(name for names in waiting for name in names)
+
     def bind(self, observed: Mapping[str, Tensor], dt: float, horizon: int) -> "Constraint":
-        """The constraint with observed quantities filled in, each [batch], at waypoints dt seconds apart."""
+        """The constraint with observed quantities filled in.
+
+        observed   each [batch]
+        dt         seconds between waypoints
+        """
         if not self.waits:
             return self
         bound = [
@@ -107,6 +172,17 @@ class Constraint:
             for part in self.parts
         ]
         return Constraint(tuple(part for parts in bound for part in parts))
+
+    def example(self, horizon: int) -> "Constraint":
+        """The constraint with 1 for every observed quantity: its form, not its parameters."""
+        forms = [
+            part.example(horizon) if isinstance(part, Bindable) else (part,) for part in self.parts
+        ]
+        return Constraint(tuple(part for parts in forms for part in parts))
+
+    def known(self) -> "Constraint":
+        """The parts that wait for no observation."""
+        return Constraint(tuple(part for part in self.parts if not isinstance(part, Bindable)))
 
     def __call__(self, x: Traj) -> Rows:
         if self.condensed is not None:
@@ -120,8 +196,9 @@ class Constraint:
         return [label for part in self.parts for label in part.labels(horizon)]
 
     def linearise(self, x: Traj) -> tuple[Rows, Pull, Rows]:
-        """g(x) [batch, n]; the pull w -> w^T dg/dx without a Jacobian; and row by row a bound of the largest eigenvalue
-        that the row can give to J J^T, for step sizes.
+        """g(x) [batch, n]; the pull w -> w^T dg/dx without a Jacobian; and a bound per row.
+
+        The bound is of the largest eigenvalue that the row can give to J J^T, for step sizes.
         """
         if self.condensed is not None:
             return self.condensed.linearise(x)
@@ -129,48 +206,45 @@ class Constraint:
         if not each:
             empty = x.new_zeros(len(x), 0)
             return empty, lambda _: torch.zeros_like(x), empty
-        sizes = (
-            [len(rows[0]) for rows, _, _ in each]
-            if len(x)
-            else [rows.shape[1] for rows, _, _ in each]
-        )
+        sizes = [rows.shape[1] for rows, _, _ in each]
 
         def pull(w: Rows) -> Traj:
-            total, at = torch.zeros_like(x), 0
+            total, begin = torch.zeros_like(x), 0
             for (_, part_pull, _), size in zip(each, sizes, strict=True):
-                total = total + part_pull(w[:, at : at + size])
-                at += size
+                total = total + part_pull(w[:, begin : begin + size])
+                begin += size
             return total
 
-        return (
-            torch.cat([e[0] for e in each], 1),
-            pull,
-            len(each) * torch.cat([e[2] for e in each], 1),
-        )
+        values, bounds = torch.cat([e[0] for e in each], 1), torch.cat([e[2] for e in each], 1)
+        return values, pull, len(each) * bounds
 
     def state_values(self, x: Traj) -> Float[Tensor, "batch horizon parts"]:
-        """Each part's value at every state, unsafe above 0 (Part.state_values)."""
-        return (
-            torch.stack([part.state_values(x) for part in self.parts], -1)
-            if self.parts
-            else x.new_empty((*x.shape[:2], 0))
-        )
+        """The value of each part at every state, unsafe above 0."""
+        if not self.parts:
+            return x.new_empty((*x.shape[:2], 0))
+        return torch.stack([part.state_values(x) for part in self.parts], -1)
 
-    def worst(self, x: Traj) -> Float[Tensor, "batch"]:  # noqa: F821
-        """The largest g of each trajectory, at its waypoints and between them; -inf where g has no rows.
+    def worst(self, x: Traj | Array) -> Array:
+        """The largest g of each trajectory, at its waypoints and between them [batch].
 
-        Between waypoints a barrier counts by its value -h, and a black box by its rows alone.
+        -inf without rows. Between waypoints a barrier counts by its value -h, and a black box by
+        its rows alone.
+
+        x   [batch, horizon, dim], numpy or torch
         """
-        rows = [values for part in self.parts for values in (part(x), part.segment_max(x))]
-        lowest = x.new_full((len(x), 1), -torch.inf)
-        return torch.cat([lowest, *rows], 1).amax(1)
+        states = torch.as_tensor(x)
+        rows = [
+            values for part in self.parts for values in (part(states), part.segment_max(states))
+        ]
+        lowest = states.new_full((len(states), 1), -torch.inf)
+        return torch.cat([lowest, *rows], 1).amax(1).numpy(force=True)
 
     def on_segments(self) -> "Constraint":
-        """The constraint that holds all along the segments, as far as the form of each part allows."""
+        """The constraint on whole segments, as far as the form of each part allows."""
         return Constraint(tuple(part for whole in self.parts for part in whole.on_segments()))
 
     def condense(self, horizon: int, dim: int) -> AffineRows | None:
-        """The rows as one matrix, float64, from their values and pulls at 0; None where a part is not affine.
+        """The rows as one matrix in float64, from their values and pulls at 0; None if not affine.
 
         For short windows, where one call for all parts is faster than one call per part.
         """
@@ -186,22 +260,49 @@ class Constraint:
         return Constraint(tuple(part.tighten(margin) for part in self.parts))
 
     def select(self, which: Tensor) -> "Constraint":
-        """The same constraint of some plans of the batch alone."""
+        """The same constraint for some plans of the batch alone."""
         return Constraint(tuple(part.select(which) for part in self.parts))
 
     def to(self, like: Tensor) -> "Constraint":
-        """The same constraint with its numbers in the dtype and on the device of `like`."""
+        """The same constraint with its parameters in the dtype and on the device of `like`."""
         return Constraint(tuple(part.to(like) for part in self.parts))
 
 
 def stack(constraints: Sequence[Constraint]) -> Constraint:
-    """All of them at once."""
+    """One constraint with the parts of all of them."""
     return Constraint(tuple(part for constraint in constraints for part in constraint.parts))
 
 
 def pull_back(g: Constraint, centre: Tensor, scale: Tensor) -> Constraint:
-    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their values and units.
+    """The same set in normalised coordinates z, x = centre + scale * z; the rows keep their units.
 
-    centre, scale   [dim], or by plan and waypoint: [horizon | 1, dim] or [batch | 1, horizon | 1, dim]
+    centre, scale   [dim], or [horizon | 1, dim], or [batch | 1, horizon | 1, dim]
     """
     return Constraint(tuple(part.pull_back(centre, scale) for part in g.parts))
+
+
+def movable_rows(part: TrajectoryConstraint, pins: Pins) -> Bool[Tensor, "n"]:  # noqa: F821
+    """Which rows of the part depend on a waypoint that is not pinned as a whole.
+
+    All rows count as movable where the support of the part is not known.
+    """
+    free = (~pins.mask).any(1)
+    if not part.support:
+        return free.new_ones(len(part.labels(len(free))))
+    if len(free) < part.support:
+        return free[:0]
+    return free.unfold(0, part.support, 1).any(1)
+
+
+def check_fixed_rows(part: TrajectoryConstraint, pins: Pins, tolerance: float) -> None:
+    """Raise InfeasibleError where a row that pins alone decide is violated by the tolerance."""
+    fixed = ~movable_rows(part, pins)
+    if not bool(fixed.any()):
+        return
+    violated = (fixed & (part(pins.values) > tolerance)).any(0)
+    if bool(violated.any()):
+        row = int(violated.nonzero()[0])
+        raise InfeasibleError(
+            f"the pinned state violates {part.labels(len(pins.mask))[row]}; move the start or goal,"
+            " or the constraint"
+        )

@@ -1,23 +1,28 @@
 """A state constraint that holds at every waypoint."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
 
 from cdiff_cli.arrays import Pull, Rows, Traj
+from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import StateSet, converted, segment_max, selected
 from cdiff_cli.constraints.segments import keep_on_segments
-from cdiff_cli.constraints.state_sets import StateSet, converted, is_affine, segment_max, selected
-from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.constraints.state_sets import is_affine
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint, check_fixed_rows
 
 
 @dataclass(frozen=True)
 class AtWaypoints:
-    """f(x^tau) <= 0 at every waypoint: one row a waypoint."""
+    """f(x^tau) <= 0 at every waypoint: one row per waypoint."""
 
     name: str
     level: StateSet
 
+    support = 1
     spans = True
+    exact_on_segments = True
 
     @property
     def affine(self) -> bool:
@@ -52,8 +57,20 @@ class AtWaypoints:
             return self(x)
         return segment_max(self.level, x)
 
+    def segment_argmax(self, x: Traj) -> Rows:
+        return self.level.segment_argmax(x)
+
     def state_values(self, x: Traj) -> Rows:
         return self.level(x)
 
     def on_segments(self) -> "tuple[TrajectoryConstraint, ...]":
         return (self if self.level.convex else keep_on_segments(self.name, self.level),)
+
+    def coordinates(self, dim: int) -> list[int]:
+        return self.level.coordinates()
+
+    def restrict(self, columns: Sequence[int]) -> "AtWaypoints":
+        return replace(self, level=self.level.restrict(columns))
+
+    def check_pins(self, pins: Pins, tolerance: float) -> None:
+        check_fixed_rows(self, pins, tolerance)

@@ -15,8 +15,6 @@ import numpy as np
 import torch
 
 from cdiff_cli.arrays import Array
-from cdiff_cli.constraints.rate import RateLimit
-from cdiff_cli.constraints.state_sets import StateSet
 from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
 from cdiff_cli.tasks.protocol import Task
 
@@ -40,6 +38,13 @@ class Saved(NamedTuple):
     x: Array
     seeds: Sequence[int]
     sha256: str
+
+
+class Axes(NamedTuple):
+    """What naming a place in a plan takes: coordinates, and seconds between waypoints."""
+
+    layout: tuple[str, ...]
+    dt: float
 
 
 def certificate(
@@ -90,7 +95,7 @@ def summary(counts: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _entries(task: Task, g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
+def _entries(task: Task | Axes, g: Constraint, plan: Saved, rollout: Saved | None) -> list[Entry]:
     """One entry per plan and constraint, plan by plan."""
     by_part = [
         (
@@ -139,7 +144,7 @@ def _counts(entries: Sequence[Entry], n: int, parts: int, executed: bool) -> dic
     }
 
 
-def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
+def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task | Axes) -> list[Entry]:
     """The worst row of each plan: its value, label, waypoint tau and state.
 
     The waypoint of a row on a step is the one that the step leads to.
@@ -165,26 +170,24 @@ def _at_waypoints(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entr
     return entries
 
 
-def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry]:
+def _on_segments(part: TrajectoryConstraint, x: Array, task: Task | Axes) -> list[Entry]:
     """The worst value on the segments between waypoints of each plan, and its first place.
 
     The value is exact for a constraint over a state set (StateSet.segment_argmax), for one that
     says nothing about segments, and for a rate limit: a rate is constant on a segment, and its
     place is the start. For every other constraint it is a lower bound of the maximum.
     """
-    level: StateSet | None = getattr(part, "level", None)
-    constant = isinstance(part, RateLimit)
-    exact = level is not None or constant or not part.spans
+    exact = part.exact_on_segments
     rows = _values(part.segment_max(_tensor(x)))
     segments = [_first_worst(values) for values in rows]
-    if (level is None and not constant) or any(segment is None for segment in segments):
-        places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
-    else:
+    shares = None
+    places: list[Entry] = [{"segment": None, "time": None, "state": None}] * len(x)
+    if exact and all(segment is not None for segment in segments):
         plan, segment = np.arange(len(x)), np.array(segments)
         begin, end = x[plan, segment], x[plan, np.minimum(segment + 1, x.shape[1] - 1)]
-        share = np.zeros(len(x))
-        if level is not None:
-            share = level.segment_argmax(_tensor(np.stack((begin, end), 1)))[:, 0].numpy()
+        shares = part.segment_argmax(_tensor(np.stack((begin, end), 1)))
+    if shares is not None:
+        share = shares[:, 0].numpy()
         point = begin + share[:, None] * (end - begin)
         places = [
             {"segment": int(j), "time": _time(j + s, task), "state": _state(task, p)}
@@ -198,7 +201,7 @@ def _on_segments(part: TrajectoryConstraint, x: Array, task: Task) -> list[Entry
     ]
 
 
-def _executed(part: TrajectoryConstraint, rollout: Saved | None, task: Task) -> list[Entry]:
+def _executed(part: TrajectoryConstraint, rollout: Saved | None, task: Task | Axes) -> list[Entry]:
     """The worst row over the executed states of each episode, up to its end."""
     if rollout is None:
         return []
@@ -239,7 +242,7 @@ def _waypoint(
     step = re.search(r"@\d+-(\d+)$", label)
     if step is not None:
         return int(step[1])
-    single = re.search(r"@(\d+)$", label) if hasattr(part, "level") else None
+    single = re.search(r"@(\d+)$", label) if part.support == 1 else None
     return int(single[1]) if single is not None else row if rows == horizon else None
 
 
@@ -252,12 +255,12 @@ def _number(value: Any) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _time(steps: Any, task: Task) -> float:
+def _time(steps: Any, task: Task | Axes) -> float:
     """Time [s], rounded to nanoseconds: 0.57, not 0.5700000000000001."""
     return round(float(steps) * task.dt, 9)
 
 
-def _state(task: Task, point: Array) -> dict[str, float | None]:
+def _state(task: Task | Axes, point: Array) -> dict[str, float | None]:
     return {name: _number(value) for name, value in zip(task.layout, point, strict=True)}
 
 
@@ -267,3 +270,9 @@ def _tensor(x: Array) -> torch.Tensor:
 
 def _values(rows: torch.Tensor) -> Array:
     return np.asarray(rows.detach().numpy())
+
+
+def certify(g: Constraint, x: Array, axes: Axes) -> tuple[dict[str, int | None], list[Entry]]:
+    """Counts and entries of trajectories x [n, horizon, dim] that no run directory holds."""
+    entries = _entries(axes, g, Saved(x, range(len(x)), ""), None)
+    return _counts(entries, len(x), len(g.parts), executed=False), entries

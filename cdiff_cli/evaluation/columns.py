@@ -1,4 +1,4 @@
-"""The columns of rows.csv and of tables: heading, digits and definition of each, and which table shows which."""
+"""The columns of rows.csv and of tables: heading, digits, definition, and the tables they form."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,16 +8,19 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """How a metric is shown: heading with unit, digits, what it is."""
+    """How a metric is shown: heading with unit, digits after the point, definition.
+
+    share   each value is 0 or 1, so that the mean is a rate
+    """
 
     title: str
     digits: int
     meaning: str
+    share: bool = False
 
-    @property
-    def share(self) -> bool:
-        """Whether each value is 0 or 1, so that the mean is a rate."""
-        return self.meaning.startswith(("share of plans", "share of episodes"))
+
+def _rate(title: str, meaning: str) -> Column:
+    return Column(title, 2, meaning, share=True)
 
 
 COLUMNS = {
@@ -38,43 +41,38 @@ COLUMNS = {
         "worst segment / g", 4, "largest g on the straight segments between waypoints"
     ),
     "jump": Column("jump / m", 4, "largest distance between neighbouring waypoints"),
-    "mean_speed": Column(
-        "speed / m/s", 2, "mean speed the plan asks for: its length over its duration"
-    ),
+    "mean_speed": Column("speed / m/s", 2, "mean speed of the plan: its length over its duration"),
     "residual": Column("residual / m", 5, "mean of |p' - p - v' dt|: positions against velocities"),
     "acceleration": Column("acceleration / m/s^2", 1, "largest |v' - v| / dt"),
-    "smooth": Column(
+    "smooth": _rate(
         "smooth",
-        2,
         "share of plans whose largest jump is at most 1.2 times the data's 99.9 % quantile",
     ),
-    "torn": Column(
+    "torn": _rate(
         "torn",
-        2,
-        "share of plans that are not smooth (the trap rate): they jump across what they should go round",
+        "share of plans that are not smooth (the trap rate): they jump across an obstacle",
     ),
-    "wall": Column("in wall", 2, "share of plans with a waypoint or segment inside a wall"),
-    "safe_waypoints": Column(
-        "safe at waypoints", 2, "share of plans with no g above 1e-6 at a waypoint"
+    "wall": _rate("in wall", "share of plans with a waypoint or segment inside a wall"),
+    "safe_waypoints": _rate(
+        "safe at waypoints", "share of plans with no g above 1e-6 at a waypoint"
     ),
-    "safe_segments": Column(
-        "safe between", 2, "share of plans with no g above 1e-6 at or between the waypoints"
+    "safe_segments": _rate(
+        "safe between", "share of plans with no g above 1e-6 at or between the waypoints"
     ),
     "unsafe_segments": Column(
         "unsafe segments", 1, "number of segments between waypoints on which some g exceeds 1e-6"
     ),
-    "feasible": Column(
+    "feasible": _rate(
         "feasible",
-        2,
         "share of plans whose every step the fitted dynamics make with inputs within their bounds",
     ),
     "effort": Column(
         "effort",
         2,
-        "largest input that a step of the plan asks for, over its bound; above 1 no actuator follows",
+        "largest input that a step of the plan needs, over its bound; above 1 no actuator follows",
     ),
     "polish": Column("polish / m", 5, "largest displacement by the final exact projection"),
-    "calls": Column("calls", 0, "network calls a plan"),
+    "calls": Column("calls", 0, "network calls per plan"),
     "plan_ms": Column("plan / ms", 1, "wall time of the batch over its number of plans"),
     "step_ms": Column("step / ms", 2, "wall time of the batch over its network calls"),
     "overhead": Column("overhead / %", 1, "time outside the network over time inside it"),
@@ -83,7 +81,7 @@ COLUMNS = {
         "distance (paper)", 2, "the paper's definition: distance to the mean unconstrained plan"
     ),
     "reward": Column("return", 1, "sum of rewards"),
-    "safe_executed": Column("safe executed", 2, "share of episodes with no unsafe state, g > 1e-6"),
+    "safe_executed": _rate("safe executed", "share of episodes with no unsafe state, g > 1e-6"),
     "executed_violation": Column("executed violation / g", 4, "sum over executed states of [g]_+"),
     "executed_worst": Column("executed worst / g", 4, "largest g of an executed state"),
     "violation_rate": Column("violation rate / %", 2, "share of executed states that are unsafe"),
@@ -93,27 +91,27 @@ COLUMNS = {
     "safe_plans": Column(
         "safe plans", 3, "share of the episode's plans with no g above 1e-6 at a waypoint"
     ),
-    "fell": Column("fell", 2, "share of episodes that the environment ended early"),
-    "diverged": Column(
-        "diverged", 2, "share of episodes whose plans or states were no longer finite"
-    ),
+    "fell": _rate("fell", "share of episodes that the environment ended early"),
+    "diverged": _rate("diverged", "share of episodes whose plans or states were not finite"),
     "contacts": Column("contacts", 2, "environment steps in contact with the obstacle"),
     "braked": Column(
-        "braked / %", 1, "share of steps at which no plan obeyed and the agent braked instead"
+        "braked / %", 1, "share of steps at which no plan was feasible and the agent braked instead"
     ),
     "saturation": Column("saturation / %", 1, "share of executed inputs that are at their bounds"),
     "latency_ms": Column(
-        "latency / ms", 2, "median wall time of planning at a control step, all episodes at once"
+        "latency / ms", 2, "median wall time of planning per control step, all episodes at once"
     ),
-    "latency_p95": Column("latency 95 % / ms", 2, "its 95 % quantile"),
+    "latency_p95": Column(
+        "latency 95 % / ms", 2, "95 % quantile of the wall time of planning per control step"
+    ),
     "steps": Column("steps", 0, "environment steps"),
-    "success": Column(
+    "success": _rate(
         "success",
-        2,
         "share of episodes that end within the environment's success radius of the goal",
     ),
     "goal_distance": Column("goal distance / m", 3, "distance to the goal at the end"),
 }
+FORMATS = ("rich", "markdown", "latex", "csv", "json")
 KEYS = ("task", "constraints", "method", "preset")
 PLAN_TABLE = (
     "distance",
@@ -129,7 +127,7 @@ PLAN_TABLE = (
     "step_ms",
 )
 COSTS = ("calls", "plan_ms", "step_ms", "overhead")
-"""Of a method or a batch, not of a seed: nothing to test."""
+"""Metrics of a method or a batch, not of a seed: no test applies to them."""
 QUALITY_TABLE = (
     "wall",
     "smooth",
@@ -178,7 +176,13 @@ CONTROL_TABLE = (
 )
 PAPER_TABLE = ("distance", "distance_paper", "violation_paper", "step_ms")
 
+PLAN_SHORT_TABLE = ("violation", "safe_segments", "torn", "distance", "calls")
+ROLLOUT_SHORT_TABLE = ("safe_executed", "violation_rate", "success", "safe_segments", "distance")
+CONTROL_SHORT_TABLE = ("reward", "safe_executed", "violation_rate", "fell", "contacts")
+PAPER_CONTROL_SHORT_TABLE = ("reward", "plan_violation", "executed_violation", "violation_rate")
+"""What `cdiff compare` shows unless more is requested, the most important first."""
+
 
 def torn(smooth: float) -> float:
-    """1 where a plan is not smooth, else 0: told at comparison, from the saved column."""
+    """1 where a plan is not smooth, else 0; computed at comparison from the saved column."""
     return 1.0 - smooth

@@ -11,7 +11,11 @@ from cdiff_cli.evaluation.statistics import Interval, Test, bootstrap, holm, int
 
 @dataclass(frozen=True)
 class Cell:
-    """Mean and standard error (sample standard deviation over sqrt(n)) of one metric of one group; its interval where asked for."""
+    """Mean and standard error of one metric of one group.
+
+    error      sample standard deviation over sqrt(n); NaN for one value
+    interval   95 %; None unless requested
+    """
 
     mean: float
     error: float
@@ -26,8 +30,9 @@ class Cell:
         return cls(statistics.fmean(values), error, n, interval)
 
     def text(self, digits: int) -> str:
+        """ "1.23 ± 0.06", with its interval in brackets; no error where all values are equal."""
         mean = _number(self.mean, digits)
-        one = self.error == 0 != self.mean  # for the whole batch: times, calls
+        one = self.error == 0 != self.mean  # one value for the whole batch: times, calls
         if math.isfinite(self.error) and not one:
             mean = f"{mean} ± {self.error:.{digits}f}"
         if self.interval is None:
@@ -37,7 +42,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Group:
-    """All rows of one task, constraint file, method and preset, the newest row for each seed."""
+    """All rows of one task, constraint file, method and preset, the newest row per seed.
+
+    key   task, constraints, method, preset
+    n     number of seeds
+    """
 
     key: tuple[str, ...]
     n: int
@@ -45,52 +54,52 @@ class Group:
 
 
 def newest(rows: Sequence[Row]) -> dict[tuple[str, ...], dict[str, Row]]:
-    """The rows of each group by seed, in order of task, constraints, preset and method; the last given of a seed wins."""
-    found: dict[tuple[str, ...], dict[str, Row]] = {}
+    """The rows of each group by seed; of several rows of one seed the last wins.
+
+    Groups are in order of task, constraints, preset and method.
+    """
+    groups: dict[tuple[str, ...], dict[str, Row]] = {}
     for row in rows:
-        more = {"torn": torn(row["smooth"])} if isinstance(row.get("smooth"), float) else {}
-        found.setdefault(tuple(str(row[key]) for key in KEYS), {})[str(row.get("seed"))] = (
-            row | more
-        )
-    return {
-        key: found[key]
-        for key in sorted(
-            found,
-            key=lambda k: (k[0], k[1], _order(PRESET_ORDER, k[3]), _order(METHOD_ORDER, k[2])),
-        )
-    }
+        derived = {"torn": torn(row["smooth"])} if isinstance(row.get("smooth"), float) else {}
+        key = tuple(str(row[name]) for name in KEYS)
+        groups.setdefault(key, {})[str(row.get("seed"))] = row | derived
+
+    def position(key: tuple[str, ...]) -> tuple[str, str, tuple[int, str], tuple[int, str]]:
+        task, constraints, method, preset = key
+        return task, constraints, _order(PRESET_ORDER, preset), _order(METHOD_ORDER, method)
+
+    return {key: groups[key] for key in sorted(groups, key=position)}
 
 
 def compare(
     rows: Sequence[Row], metrics: Sequence[str] | None = None, intervals: bool = False
 ) -> list[Group]:
-    """The groups of `newest`, summed up; with 95 % intervals where asked for."""
+    """The groups of `newest` with a cell per metric, with 95 % intervals where requested."""
     groups = []
     for key, by_seed in newest(rows).items():
-        mine = list(by_seed.values())
-        names = metrics or [name for name in COLUMNS if any(_has(row, name) for row in mine)]
-        values = {name: [row[name] for row in mine if _has(row, name)] for name in names}
+        members = list(by_seed.values())
+        names = metrics or [name for name in COLUMNS if any(_has(row, name) for row in members)]
+        values = {name: [row[name] for row in members if _has(row, name)] for name in names}
         bounds = {
             name: interval(v, COLUMNS[name].share)
             for name, v in values.items()
             if intervals and name not in COSTS
         }
-        groups.append(
-            Group(
-                key,
-                len(mine),
-                {name: Cell.from_values(v, bounds.get(name)) for name, v in values.items() if v},
-            )
-        )
+        cells = {name: Cell.from_values(v, bounds.get(name)) for name, v in values.items() if v}
+        groups.append(Group(key, len(members), cells))
     return groups
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One metric of one method against the reference method, paired by seed within the same task, constraints and preset.
+    """One metric of one method against the reference method.
 
-    mean       of the differences, method minus reference; interval: 95 %, bootstrap
-    p, holm    two-sided, as tested and corrected for all tests of this metric
+    Values are paired by seed within the same task, constraints and preset.
+
+    mean       method minus reference
+    interval   95 %, bootstrap
+    p          two-sided
+    holm       p corrected for all tests of this metric
     """
 
     key: tuple[str, ...]
@@ -105,30 +114,33 @@ class Difference:
 def differences(
     rows: Sequence[Row], reference: str, metrics: Sequence[str], test: Test = "wilcoxon"
 ) -> list[Difference]:
-    """Every other method against the reference where both have rows of the same seeds; metrics that nowhere differ are left out."""
-    groups, found = newest(rows), []
+    """Every other method against the reference where both have rows of the same seeds.
+
+    A metric without any difference is left out.
+    """
+    groups, results = newest(rows), []
     for name in metrics:
         family = []
-        for key, mine in groups.items():
+        for key, by_seed in groups.items():
             task, constraints, method, preset = key
-            theirs = groups.get((task, constraints, reference, preset), {})
-            both = [seed for seed in mine if _has(mine[seed], name)]
-            both = [seed for seed in both if _has(theirs.get(seed, {}), name)]
-            d = [mine[seed][name] - theirs[seed][name] for seed in both]
+            of_reference = groups.get((task, constraints, reference, preset), {})
+            both = [seed for seed in by_seed if _has(by_seed[seed], name)]
+            both = [seed for seed in both if _has(of_reference.get(seed, {}), name)]
+            d = [by_seed[seed][name] - of_reference[seed][name] for seed in both]
             if method != reference and d and name not in COSTS:
                 p = paired_p(d, test, COLUMNS[name].share)
                 family.append(
                     Difference(key, name, len(d), statistics.fmean(d), bootstrap(d), p, p)
                 )
-        if all(each.mean == 0 and each.p == 1 for each in family):
+        if all(result.mean == 0 and result.p == 1 for result in family):
             continue
-        corrected = holm([each.p for each in family])
-        found += [replace(each, holm=p) for each, p in zip(family, corrected, strict=True)]
-    return found
+        corrected = holm([result.p for result in family])
+        results += [replace(one, holm=p) for one, p in zip(family, corrected, strict=True)]
+    return results
 
 
 def _has(row: Row, name: str) -> bool:
-    """Whether the metric has a value: of an episode that diverged at once, or never acted, some have none."""
+    """Whether the metric has a value; an episode that diverged at once has none for some."""
     return isinstance(row.get(name), float) and not math.isnan(row[name])
 
 

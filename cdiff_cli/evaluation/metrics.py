@@ -110,7 +110,7 @@ def effort(dynamics: LinearDynamics, x: Array) -> tuple[Array, NDArray[np.bool_]
     """
     states = torch.from_numpy(x)
     middle, half = (dynamics.high + dynamics.low) / 2, (dynamics.high - dynamics.low) / 2
-    share = ((dynamics.wanted(states) - middle) / half).abs().flatten(1)
+    share = ((dynamics.unbounded_inputs(states) - middle) / half).abs().flatten(1)
     return _largest(share).numpy(), (dynamics.residual(states) <= REACHED).all(1).numpy()
 
 

@@ -1,24 +1,32 @@
-"""Statistical inference for comparisons: intervals of means and rates, paired tests, Holm's correction."""
+"""Statistical inference for comparisons: intervals of means and rates, paired tests, correction.
+
+numpy and scipy are imported on first use, so that the command line starts without them.
+"""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 Interval = tuple[float, float]
 Test = Literal["wilcoxon", "t"]
-LEVEL = 0.95
-DRAWS = 9999
+LEVEL = 0.95  # coverage of the intervals
+DRAWS = 9999  # bootstrap resamples
 
 
 def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
-    """Interval of the mean, bias-corrected and accelerated bootstrap (Efron, 1987); None of fewer than two, or of infinite ones.
+    """Interval of the mean by the bias-corrected and accelerated bootstrap (Efron, 1987).
 
-    The resampling is seeded: equal values give equal intervals.
+    None for fewer than two values, or where one is infinite. The resampling is seeded, so equal
+    values give equal intervals.
     """
+    import numpy as np
     from scipy.special import ndtr, ndtri
 
     x = np.asarray(values, dtype=np.float64)
@@ -30,9 +38,7 @@ def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
         return float(mean), float(mean)
     below = ((means < mean).mean() + (means <= mean).mean()) / 2
     bias = ndtri(np.clip(below, 0.5 / DRAWS, 1 - 0.5 / DRAWS))
-    shift = (x - mean) / (
-        n - 1
-    )  # of the mean, each value left out in turn, from their average: jackknife
+    shift = (x - mean) / (n - 1)  # jackknife: means without one value, minus their average
     acceleration = (shift**3).sum() / (6 * (shift**2).sum() ** 1.5)
     z = bias + ndtri(np.array([(1 - level) / 2, (1 + level) / 2]))
     low, high = np.quantile(means, ndtr(bias + z / (1 - acceleration * z)))
@@ -41,11 +47,16 @@ def bootstrap(values: Sequence[float], level: float = LEVEL) -> Interval | None:
 
 @lru_cache(maxsize=8)
 def _resamples(n: int) -> NDArray[np.int64]:
+    import numpy as np
+
     return np.random.default_rng(0).integers(n, size=(DRAWS, n))
 
 
 def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
-    """Exact interval of a rate: the rates that a two-sided binomial test of successes in n does not reject."""
+    """Exact interval of a rate (Clopper and Pearson, 1934).
+
+    It holds the rates that a two-sided binomial test does not reject.
+    """
     from scipy.special import betaincinv
 
     tail = (1 - level) / 2
@@ -55,19 +66,21 @@ def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
 
 
 def interval(values: Sequence[float], share: bool) -> Interval | None:
-    """Of a mean, or of a rate where the values are zeros and ones."""
+    """The interval of a rate where share is set and the values are 0 and 1, else of a mean."""
     if share and set(values) <= {0.0, 1.0}:
         return clopper_pearson(round(sum(values)), len(values))
     return bootstrap(values)
 
 
 def paired_p(differences: Sequence[float], test: Test, share: bool) -> float:
-    """Two-sided p of no difference between paired values; NaN of fewer than two pairs.
+    """Two-sided p of no difference between paired values; NaN for fewer than two pairs.
 
-    wilcoxon   signed ranks, exact up to 50 pairs without ties; pairs without a difference are left out
-    t          Student's
-    share      zeros and ones: McNemar's exact test, binomial on the pairs that differ, whichever test is named
+    wilcoxon   signed ranks, exact up to 50 pairs without ties; equal pairs are left out
+    t          Student's test
+    share      differences of zeros and ones: McNemar's exact test, a binomial test on the pairs
+               that differ, whichever test is named
     """
+    import numpy as np
     from scipy import stats
 
     d = np.asarray(differences, dtype=np.float64)
@@ -84,7 +97,11 @@ def paired_p(differences: Sequence[float], test: Test, share: bool) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Holm's (1979) step-down correction of a family: the i-th smallest times m - i, made monotone, at most 1; NaN stays apart."""
+    """Corrected p values of a family of m tests by Holm's (1979) step-down procedure.
+
+    The i-th smallest (from 0) is multiplied by m - i, made monotone and cut at 1. NaN is not
+    counted in m and stays NaN.
+    """
     known = sorted((value, i) for i, value in enumerate(p) if not math.isnan(value))
     out, largest = [math.nan] * len(p), 0.0
     for rank, (value, i) in enumerate(known):

@@ -2,7 +2,8 @@
 
 With x_t = sqrt(a) x_0 + sqrt(1 - a) noise, a = alpha_bar_t, a network may predict the noise, the
 velocity v = sqrt(a) noise - sqrt(1 - a) x_0 (Salimans and Ho, 2022), or, with a noise level
-sigma = sqrt((1 - a) / a) in the place of a step, the clean x_0 of x_0 + sigma noise (Karras et al., 2022).
+sigma = sqrt((1 - a) / a) in the place of a step, the clean x_0 of x_0 + sigma noise (Karras et
+al., 2022).
 All of them hold the same information; the clean estimate is the form that constraints act on.
 """
 
@@ -17,7 +18,7 @@ from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.schedule import Schedule
 
 StepNetwork = Callable[[Tensor, Tensor], Tensor]
-"""(x_t [batch, horizon, dim], t [batch], counted from 0 for the least noise) -> a prediction of x_t's shape."""
+"""(x_t [batch, horizon, dim], t [batch], 0 for the least noise) -> a prediction of x_t's shape."""
 
 SigmaNetwork = Callable[[Tensor, Tensor], Tensor]
 """(x_0 + sigma noise [batch, horizon, dim], sigma [batch]) -> x_0."""

@@ -1,4 +1,4 @@
-"""Checkpoints: weights as safetensors, and the card that vouches for them."""
+"""Checkpoints: weights as safetensors, and a card with their hash and origin."""
 
 import hashlib
 import os
@@ -18,21 +18,24 @@ from cdiff_cli.models.networks import InverseDynamics, ResidualMlp, TemporalUnet
 from cdiff_cli.models.normaliser import Normaliser, ResidualNormaliser
 from cdiff_cli.models.recipe import Card, MlpSpec, NetworkSpec
 from cdiff_cli.paths import home, shown
+from cdiff_cli.yaml_files import load
 
 Network = TemporalUnet | ResidualMlp
-RELATIVE_LIMIT = 8.0  # of a clean estimate, in standard deviations of the data: beyond it a network has lost its way
+RELATIVE_LIMIT = 8.0  # limit of a clean estimate of a relative window, in standard deviations
 Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained denoiser and what belongs to it.
+    """A trained denoiser, with its normaliser and dynamics.
 
-    normaliser       environment units to those of the network; of control tasks the frame's, of the present state
+    normaliser       environment units to those of the network; with a frame, of the present state
     demonstrations   a few windows of the training data, environment units   [k, horizon, dim]
-    dynamics         linear dynamics fitted to the training data, environment units; None where there were no inputs to fit
-    frame, inverse   of control tasks: the relative windows, and u = IDM(x^0, x^1)
-    telling          of planners conditioned on what they observe: how they are told
+    dynamics         linear dynamics of the training data, environment units; None if they explain
+                     too little of it, or if the data has no inputs
+    frame            normaliser of windows relative to their first state; None without
+    inverse          inverse dynamics u = IDM(x^0, x^1), environment units; None without
+    telling          encoder of the observed quantities of a conditional planner; None without
     """
 
     net: Network
@@ -47,12 +50,12 @@ class Checkpoint:
 
     @property
     def limit(self) -> float:
-        """Of a clean estimate, in the network's coordinates: the data's limits, or RELATIVE_LIMIT."""
+        """Limit of a clean estimate, in normalised coordinates."""
         return 1.0 if self.frame is None else RELATIVE_LIMIT
 
 
 def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:
-    """A network of that size, its weights drawn from the global generator."""
+    """A network of that size, with weights drawn from the global generator."""
     if isinstance(network, MlpSpec):
         return ResidualMlp(dim, horizon, network.width, network.depth, network.conditions)
     return TemporalUnet(dim, **network.model_dump(exclude={"kind"}))
@@ -61,7 +64,7 @@ def build(dim: int, horizon: int, network: NetworkSpec | MlpSpec) -> Network:
 def write_safetensors(
     path: Path, tensors: dict[str, Tensor], facts: dict[str, str] | None = None
 ) -> None:
-    """Written beside its place and renamed, so that a reader never meets half a file."""
+    """Write a file beside its place and rename it, so that no reader gets half of it."""
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         save_file(tensors, partial, facts)
@@ -72,6 +75,7 @@ def write_safetensors(
 
 
 def read_safetensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a file; the CheckpointError of a bad one ends with the advice."""
     from safetensors import SafetensorError, safe_open
 
     if not path.exists():
@@ -87,7 +91,7 @@ def read_safetensors(path: Path, advice: str) -> tuple[dict[str, Tensor], dict[s
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> Checkpoint:
-    """Weights, then the card that vouches for them."""
+    """Write the weights, then the card with their hash; returns the checkpoint as loaded."""
     write_safetensors(path, tensors)
     card |= {"weights_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     text = yaml.safe_dump(Card(**card).model_dump(mode="json"), sort_keys=False)
@@ -98,11 +102,15 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]
 
 
 def card_path(path: Path) -> Path:
+    """Path of the card of a checkpoint."""
     return path.with_name(path.name.removesuffix(".safetensors") + ".card.yaml")
 
 
 def install(checkpoint: Checkpoint) -> Path:
-    """Put a finished checkpoint where `cdiff plan` looks; the one that stood there is kept as <recipe>.previous."""
+    """Copy a finished checkpoint to models/<task>/, where `cdiff plan` looks.
+
+    An older one of the same recipe is kept as <recipe>.previous.
+    """
     folder = home() / "models" / checkpoint.card.task
     target = folder / f"{checkpoint.card.recipe}.safetensors"
     if target.exists():
@@ -118,10 +126,37 @@ def install(checkpoint: Checkpoint) -> Path:
 def load_checkpoint(
     path: Path, task: str | None = None, device: torch.device | str = "cpu"
 ) -> Checkpoint:
-    """A checkpoint with its card; CheckpointError where either is missing, damaged, or of another task."""
-    from cdiff_cli.yaml_files import load
+    """A checkpoint; CheckpointError if it or its card is missing, damaged, or of another task."""
+    advice = (
+        f"train one with `cdiff train --task {task or path.parent.name}`, "
+        "or name another with --checkpoint"
+    )
+    card = _verified_card(path, task, advice)
+    tensors, _ = read_safetensors(path, advice)
+    parts: dict[str, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        part, _, rest = name.partition(".")
+        parts.setdefault(part, {})[rest] = value
+    normaliser, windows = Normaliser(**parts["normaliser"]), parts["demonstrations"][""]
+    with torch.random.fork_rng(devices=[]):
+        net = build(windows.shape[-1], card.horizon, card.network)
+    return Checkpoint(
+        _loaded(net, parts["net"], device),
+        normaliser,
+        windows,
+        card,
+        path,
+        dynamics=LinearDynamics(**parts["dynamics"]) if "dynamics" in parts else None,
+        frame=ResidualNormaliser.from_record(normaliser, parts["frame"])
+        if "frame" in parts
+        else None,
+        inverse=_inverse(parts["inverse"], device) if "inverse" in parts else None,
+        telling=ObservationEncoder(**parts["telling"]) if "telling" in parts else None,
+    )
 
-    advice = f"train one with `cdiff train --task {task or path.parent.name}`, or name another with --checkpoint"
+
+def _verified_card(path: Path, task: str | None, advice: str) -> Card:
+    """The card of a checkpoint, if it belongs to the task and the weights have its hash."""
     if not path.exists():
         raise CheckpointError(f"{shown(path)}: no such checkpoint; {advice}")
     if not card_path(path).exists():
@@ -133,33 +168,13 @@ def load_checkpoint(
         raise CheckpointError(
             f"{shown(path)}: a checkpoint of {card.task}, asked for was {task}; {advice}"
         )
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    if found != card.weights_sha256:
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    if sha256 != card.weights_sha256:
         raise CheckpointError(
-            f"{shown(path)}: truncated or altered: sha256 {found[:12]}..., its card says {card.weights_sha256[:12]}...; "
-            f"restore it, or {advice}"
+            f"{shown(path)}: truncated or altered: sha256 {sha256[:12]}..., "
+            f"its card says {card.weights_sha256[:12]}...; restore it, or {advice}"
         )
-    tensors, _ = read_safetensors(path, advice)
-    parts: dict[str, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        part, _, rest = name.partition(".")
-        parts.setdefault(part, {})[rest] = value
-    normaliser, windows = Normaliser(**parts["normaliser"]), parts["demonstrations"][""]
-    dim = windows.shape[-1]
-    with torch.random.fork_rng(devices=[]):
-        net = build(dim, card.horizon, card.network)
-    dynamics = LinearDynamics(**parts["dynamics"]) if "dynamics" in parts else None
-    return Checkpoint(
-        _loaded(net, parts["net"], device),
-        normaliser,
-        windows,
-        card,
-        path,
-        dynamics,
-        ResidualNormaliser.from_record(normaliser, parts["frame"]) if "frame" in parts else None,
-        _inverse(parts["inverse"], device) if "inverse" in parts else None,
-        ObservationEncoder(**parts["telling"]) if "telling" in parts else None,
-    )
+    return card
 
 
 def _loaded(net: Module, tensors: dict[str, Tensor], device: torch.device | str) -> Module:

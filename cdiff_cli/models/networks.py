@@ -1,4 +1,4 @@
-"""The networks: nn.Modules and nothing else."""
+"""The networks."""
 
 import math
 from itertools import pairwise
@@ -10,26 +10,29 @@ from torch.nn import functional as F
 
 
 class TemporalUnet(nn.Module):
-    """U-Net over the horizon that predicts the clean trajectory from a noisy one whose pinned waypoints are clean.
+    """A U-Net over the horizon predicts the clean trajectory from a noisy one with clean pins.
 
-    Diffuser's architecture (Janner et al., 2022): residual blocks of two kernel-5 convolutions, the diffusion step added
-    between them, stride-2 down- and upsampling between levels, skip connections. Two additions, for plans that do not jump
-    at their pinned ends: every waypoint sees the pinned states as further channels, and within `ramp` waypoints of an end
-    the output is blended into the pinned state. Two more, off by default, for planners that learn within the hour:
+    The architecture is Diffuser's (Janner et al., 2022): residual blocks of two kernel-5
+    convolutions with the diffusion step added in between, stride-2 down- and upsampling between
+    levels, and skip connections. Two additions keep plans from jumping at their pinned ends. Every
+    waypoint gets the pinned states as further channels. Within `ramp` waypoints of an end the
+    output is blended into the pinned state. Two more, off by default, shorten the training:
 
-    patch    waypoints a token. Above 1 the U-Net works on horizon / patch tokens and its output is a uniform cubic B-spline
-             with one knot a token: fewer tokens to convolve, and no jitter left to unlearn
-    octaves  Fourier features sin, cos(2^k pi z), k < octaves, of the pinned states, and of an estimate of the clean
-             trajectory made at each level on the way up and fed back there: walls are sharp functions of the position, which
-             convolutions of z alone learn slowly
+    patch        waypoints per token. Above 1 the U-Net works on horizon / patch tokens, and its
+                 output is a uniform cubic B-spline with one knot per token. There are fewer tokens
+                 to convolve and no jitter to unlearn
+    octaves      number of Fourier features sin, cos(2^k pi z), k < octaves. They are features of
+                 the pinned states, and of an estimate of the clean trajectory that each level on
+                 the way up makes and gets back. Walls are sharp functions of the position, which
+                 convolutions of z alone learn slowly
 
-    conditions  entries of a label that the estimate can be conditioned on (labels.py)
-
-    dim         number of coordinates of a waypoint
-    width       channels of the first level
-    multipliers channels of each level, in units of width; the horizon must divide by patch * 2^(levels - 1)
-    ends        the pinned waypoints: 0 the first, -1 the last
-    ramp        length of the blend, waypoints
+    conditions   entries of a label that the estimate can be conditioned on (labels.py)
+    dim          number of coordinates of a waypoint
+    width        channels of the first level
+    multipliers  channels of each level, in units of width; patch * 2^(levels - 1) divides the
+                 horizon
+    ends         pinned waypoints: 0 the first, -1 the last
+    ramp         length of the blend, in waypoints
     """
 
     def __init__(
@@ -47,7 +50,7 @@ class TemporalUnet(nn.Module):
         nn.Module.__init__(self)
         self.ends, self.ramp, self.patch, self.octaves = ends, ramp, patch, octaves
         channels = [width * m for m in multipliers]
-        seen = dim * (1 + len(ends) * (1 + 2 * octaves))
+        inputs = dim * (1 + len(ends) * (1 + 2 * octaves))
         self.stride = patch * 2 ** (len(channels) - 1)
         self.embed = nn.Sequential(
             SinusoidalStep(width),
@@ -56,7 +59,7 @@ class TemporalUnet(nn.Module):
             nn.Linear(4 * width, width),
         )
         self.stem = (
-            nn.Conv1d(seen, width, 2 * patch, stride=patch, padding=patch // 2)
+            nn.Conv1d(inputs, width, 2 * patch, stride=patch, padding=patch // 2)
             if patch > 1
             else nn.Identity()
         )
@@ -70,7 +73,7 @@ class TemporalUnet(nn.Module):
                     else nn.Identity(),
                 )
             )
-            for i, (c_in, c_out) in enumerate(pairwise([width if patch > 1 else seen, *channels]))
+            for i, (c_in, c_out) in enumerate(pairwise([width if patch > 1 else inputs, *channels]))
         )
         top = channels[-1]
         self.middle = nn.ModuleList(
@@ -98,12 +101,14 @@ class TemporalUnet(nn.Module):
         self.condition = _condition(conditions, width)
 
     def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
-        """The clean estimate [batch, horizon, dim] of the noisy trajectories x at the diffusion steps t [batch]."""
+        """Clean estimate [batch, horizon, dim] of noisy trajectories x at steps t [batch]."""
         return self.estimates(x, t, condition)[-1]
 
     def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
-        """Estimates of the clean trajectory, of rising resolution [batch, horizon / k, dim]: the last one is the output, the
-        others (none without octaves) estimate means over k waypoints and are trained along.
+        """Clean estimates at rising resolution [batch, horizon / k, dim].
+
+        The last one is the output. The others estimate means over k waypoints and have a loss of
+        their own; without octaves there are none.
         """
         pinned = [x[:, [end]] for end in self.ends]
         features = [
@@ -115,7 +120,7 @@ class TemporalUnet(nn.Module):
         skips, guesses = [], []
 
         def look(level: int, h: Tensor) -> Tensor:
-            """h, told where in the world the trajectory seems to be."""
+            """h with the features of a clean estimate from h added."""
             if not self.octaves:
                 return h
             guess = self.guess[level](h).float()
@@ -144,12 +149,12 @@ class TemporalUnet(nn.Module):
         return [*guesses, estimate]
 
     def _fourier(self, z: Tensor) -> list[Tensor]:
-        """Sines and cosines of z at each octave, every one of the shape of z."""
+        """Sines and cosines of z at each octave, all with the shape of z."""
         angles = [2**k * math.pi * z for k in range(self.octaves)]
         return [f(angle) for angle in angles for f in (torch.sin, torch.cos)]
 
     def _share(self, end: int, x: Tensor) -> Tensor:
-        """Share of the pinned state in the output [horizon, 1]: 1 at the end, falling to 0 within the ramp."""
+        """Share of the pinned state in the output [horizon, 1]: 1 at the end, 0 after the ramp."""
         ramp = min(self.ramp, x.shape[1] // 2)
         tau = torch.arange(x.shape[1], device=x.device, dtype=x.dtype)
         share = (1 - tau / max(ramp, 1)).clamp_min(0.0)[:, None]
@@ -157,12 +162,12 @@ class TemporalUnet(nn.Module):
 
 
 class ResidualMlp(nn.Module):
-    """A residual network on the whole window at once, for the short windows of control: it predicts the clean window from a noisy
-    one whose first waypoint is given.
+    """A residual network predicts a clean window from a noisy one with a clean first waypoint.
 
-    Blocks h + W2 silu(W1 norm(h) + step), all of the same width.
+    It works on the whole window at once, for the short windows of receding-horizon control. Its
+    blocks h + W2 silu(W1 norm(h) + step) have the same width.
 
-    horizon, dim   of a window
+    horizon, dim   size of a window
     width, depth   channels and number of the blocks
     """
 
@@ -184,11 +189,11 @@ class ResidualMlp(nn.Module):
         self.condition = _condition(conditions, width)
 
     def forward(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> Tensor:
-        """The clean estimate [batch, horizon, dim] of the noisy windows x at the diffusion steps t [batch]."""
+        """Clean estimate [batch, horizon, dim] of noisy windows x at steps t [batch]."""
         return self.estimates(x, t, condition)[-1]
 
     def estimates(self, x: Tensor, t: Tensor, condition: Tensor | None = None) -> list[Tensor]:
-        """As TemporalUnet.estimates; there is one."""
+        """The clean estimate, as the only element of a list."""
         h, step = self.stem(x.flatten(1)), self.embed(t)
         step = step if condition is None else step + self.condition(condition)
         for norm, inward, outward in cast(Any, self.blocks):
@@ -198,10 +203,12 @@ class ResidualMlp(nn.Module):
 
 
 class InverseDynamics(nn.Module):
-    """u = IDM(x, x'): the input that leads from a state to another, a network on the normalised state and the normalised change.
+    """A network u = IDM(x, x') predicts the input that leads from a state to another.
 
-    centre, scale      of the state, environment units            [2, dim]: of x, of x' - x
-    low, high          bounds of the input, which u is kept in    [m]
+    It gets the normalised state and the normalised change.
+
+    centre, scale   of x and of x' - x, environment units   [2, dim]
+    low, high       bounds to which u is clipped            [m]
     """
 
     def __init__(self, dim: int, inputs: int, width: int = 256) -> None:
@@ -222,19 +229,26 @@ class InverseDynamics(nn.Module):
         )
 
     def raw(self, x: Tensor, after: Tensor) -> Tensor:
-        """The input before it is clipped [batch, m], of states and their successors [batch, dim], environment units."""
+        """Input before clipping [batch, m], for states and successors [batch, dim].
+
+        States are in environment units.
+        """
         centre, scale = cast(Tensor, self.centre), cast(Tensor, self.scale)
-        seen = torch.cat(((x - centre[0]) / scale[0], (after - x - centre[1]) / scale[1]), -1)
-        return cast(Tensor, self.layers(seen))
+        features = torch.cat(((x - centre[0]) / scale[0], (after - x - centre[1]) / scale[1]), -1)
+        return cast(Tensor, self.layers(features))
 
     def forward(self, x: Tensor, after: Tensor) -> Tensor:
+        """Input [batch, m], for states and successors [batch, dim]."""
         return torch.minimum(
             torch.maximum(self.raw(x, after), cast(Tensor, self.low)), cast(Tensor, self.high)
         )
 
 
 def _condition(conditions: int, width: int) -> nn.Module:
-    """Labels [batch, conditions] into the embedding of the diffusion step: linear, so that zeros mean none, and zero at first."""
+    """A map of labels [batch, conditions] into the embedding of the diffusion step.
+
+    It is linear, so that zeros mean no label, and zero before training.
+    """
     layer = nn.Linear(conditions, width, bias=False) if conditions else nn.Identity()
     if isinstance(layer, nn.Linear):
         nn.init.zeros_(layer.weight)
@@ -242,8 +256,9 @@ def _condition(conditions: int, width: int) -> nn.Module:
 
 
 def _spline(knots: Tensor, patch: int) -> Tensor:
-    """The uniform cubic B-spline of the knots [batch, dim, n], sampled at `patch` points a knot [batch, dim, n * patch];
-    the end knots are repeated.
+    """Uniform cubic B-spline of knots [batch, dim, n], at `patch` points per knot.
+
+    Its shape is [batch, dim, n * patch]. The end knots are repeated.
     """
     if patch == 1:
         return knots
@@ -269,12 +284,13 @@ class SinusoidalStep(nn.Module):
         )
 
     def forward(self, t: Tensor) -> Tensor:
+        """Features [batch, width] of the steps t [batch]."""
         angle = t[:, None] * cast(Tensor, self.frequency)
         return torch.cat((angle.sin(), angle.cos()), -1)
 
 
 class ConvBlock(nn.Sequential):
-    """Convolution of kernel 5, group normalisation, Mish: [batch, c_in, horizon] -> [batch, c_out, horizon]."""
+    """Kernel-5 convolution, group norm, Mish: [batch, c_in, horizon] -> [batch, c_out, horizon]."""
 
     def __init__(self, c_in: int, c_out: int) -> None:
         nn.Sequential.__init__(
@@ -283,7 +299,7 @@ class ConvBlock(nn.Sequential):
 
 
 class ResidualBlock(nn.Module):
-    """Two ConvBlocks with the embedded diffusion step added in between, and a skip connection."""
+    """Two ConvBlocks, with the embedded diffusion step added in between, and a skip connection."""
 
     def __init__(self, c_in: int, c_out: int, width: int) -> None:
         nn.Module.__init__(self)
@@ -292,5 +308,6 @@ class ResidualBlock(nn.Module):
         self.skip = nn.Conv1d(c_in, c_out, 1) if c_in != c_out else nn.Identity()
 
     def forward(self, x: Tensor, step: Tensor) -> Tensor:
+        """Features [batch, c_out, horizon] of x [batch, c_in, horizon] at step [batch, width]."""
         h = self.first(x) + self.step(F.mish(step))[:, :, None]
         return self.second(h) + self.skip(x)

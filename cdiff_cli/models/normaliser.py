@@ -53,12 +53,13 @@ class Normaliser:
     def from_limits(cls, low: ArrayLike, high: ArrayLike) -> "Normaliser":
         """[low, high] of each coordinate to [-1, 1]   [dim], environment units
 
-        Raises ValueError where a coordinate has no width.
+        Raises ValueError where a coordinate has no width, or an infinite one.
         """
         bottom, top = (torch.as_tensor(np.asarray(v, dtype=np.float64)) for v in (low, high))
-        if bottom.shape != top.shape or bottom.ndim != 1 or not bool((bottom < top).all()):
+        vectors = bottom.shape == top.shape and bottom.ndim == 1
+        if not vectors or not bool(((bottom < top) & (top - bottom).isfinite()).all()):
             raise ValueError(
-                f"expected low < high for every coordinate, found {low!r} and {high!r}"
+                f"expected low < high for every coordinate, both finite, found {low!r} and {high!r}"
             )
         return cls((bottom + top) / 2, (top - bottom) / 2)
 

@@ -1,4 +1,4 @@
-"""A planner as a value: a denoiser and what has to be known to sample it, wherever it was trained."""
+"""A planner as a value: a denoiser and what sampling has to know about it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

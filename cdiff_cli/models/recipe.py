@@ -1,9 +1,10 @@
-"""Recipes and cards: how a task's model is trained and sampled, and what a trained checkpoint says of itself."""
+"""Recipes and cards: how a task's model is trained and sampled, and what a checkpoint records."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic_core import InitErrorDetails
 
 from cdiff_cli.models.preset import Count, Positive, Preset
 from cdiff_cli.paths import home, shown
@@ -14,9 +15,8 @@ class NetworkSpec(Strict):
     """Size of the TemporalUnet (networks.py); the defaults are Diffuser's architecture."""
 
     kind: Literal["unet"] = "unet"
-    width: Annotated[int, Field(gt=0, multiple_of=8)] = (
-        32  # the channels are normalised in 8 groups
-    )
+    # A multiple of 8: the channels are normalised in 8 groups.
+    width: Annotated[int, Field(gt=0, multiple_of=8)] = 32
     multipliers: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1, 2, 4)
     patch: Literal[1, 2, 4, 8, 16] = 1
     octaves: Annotated[int, Field(ge=0, le=10)] = 0
@@ -24,7 +24,7 @@ class NetworkSpec(Strict):
 
     @property
     def stride(self) -> int:
-        """What the horizon must divide by."""
+        """The number that the horizon must be a multiple of."""
         return self.patch * 2 ** (len(self.multipliers) - 1)
 
 
@@ -44,7 +44,8 @@ class MlpSpec(Strict):
 class InverseSpec(Strict):
     """How the inverse dynamics model is trained.
 
-    ahead   waypoints between the two states it is asked about: 1, or more where one input hardly moves the state
+    ahead   waypoints between the two states that the model is given: 1, or more where one input
+            hardly moves the state
     """
 
     width: Positive = 256
@@ -55,9 +56,10 @@ class InverseSpec(Strict):
 
 
 class ReturnSpec(Strict):
-    """How windows are labelled by what is earned from their first state on (return_labels.py).
+    """How windows are labelled by the return from their first state (return_labels.py).
 
-    discount   of a reward one step later; of the walk, 1 / (1 - discount) steps must be left for a label
+    discount   factor per step on later rewards; a window is labelled where at least
+               1 / (1 - discount) steps follow
     """
 
     discount: Annotated[float, Field(gt=0, lt=1)] = 0.99
@@ -66,9 +68,9 @@ class ReturnSpec(Strict):
 class TrainSpec(Strict):
     """One way to train; the defaults are those of the small recipe.
 
-    begin     the recipe whose checkpoint is trained on, None: from the beginning
-    returns   condition the planner on the return, for Recipe.returns to ask for the most; None: it knows of none
-    dropout   of planners conditioned on constraints or the return, share of the windows shown without their label
+    begin     recipe whose checkpoint training starts from; None: from random weights
+    returns   condition the planner on the return, which Recipe.returns then guides; None: do not
+    dropout   share of the windows shown without their label, for conditional planners
     """
 
     network: NetworkSpec | MlpSpec = NetworkSpec()
@@ -97,8 +99,11 @@ class DemonstrationSpec(Strict):
 
 
 class PaperUnits(Strict):
-    """The paper's own definitions where they differ: its violation is ours times `violation`, its distance sums
-    (distance to the mean unconstrained plan) ** distance_power."""
+    """The paper's definitions where they differ from ours.
+
+    violation        factor from our violation to the paper's
+    distance_power   the paper sums (distance to the mean unconstrained plan) ** distance_power
+    """
 
     violation: float = 1.0
     distance_power: float = 1.0
@@ -107,9 +112,11 @@ class PaperUnits(Strict):
 class Recipe(Strict):
     """models/<task>/recipe.yaml
 
-    frame     limits: the data's limits to [-1, 1]; relative: windows relative to their first state (normaliser.py), for control
-    returns   weight of guidance towards the highest return, the same for all methods and presets, where the checkpoint is
-              conditioned on it: 0 asks for none, 1 is the conditioned estimate itself, others take two network calls a step
+    frame     the normaliser: `limits` maps the data's limits to [-1, 1], `relative` sees windows
+              relative to their first state (normaliser.py), for control
+    returns   guidance weight towards the highest return, for a checkpoint conditioned on it, the
+              same for all methods and presets; 0: none, 1: the conditioned estimate itself; other
+              weights take two network calls per step
     """
 
     task: str
@@ -131,11 +138,13 @@ class Recipe(Strict):
             stride = spec.network.stride
             if self.horizon % stride:
                 raise ValueError(
-                    f"train.{name}: the horizon {self.horizon} does not divide by {stride}, its network's stride"
+                    f"train.{name}: the horizon {self.horizon} does not divide by {stride}, "
+                    "its network's stride"
                 )
             if spec.returns and self.frame != "relative":
                 raise ValueError(
-                    f"train.{name}.returns: for control tasks (frame: relative), whole plans earn nothing; leave it out"
+                    f"train.{name}.returns: for control tasks (frame: relative), "
+                    "whole plans earn nothing; leave it out"
                 )
         return self
 
@@ -147,15 +156,13 @@ class Recipe(Strict):
             return presets
         whole: dict[str, Any] = {}
         for name, preset in presets.items():
-            values = dict(preset) if isinstance(preset, dict) else preset
-            if isinstance(values, dict) and "like" in values:
-                base = values.pop("like")
-                if base not in whole:
-                    raise ValueError(
-                        f"{name}.like: expected a preset above it, found {base!r}; "
-                        f"above it are: {', '.join(whole) or 'none'}"
-                    )
-                values = merged(whole[base], values)
+            values = preset
+            if isinstance(preset, dict) and "like" in preset:
+                base, values = preset["like"], {k: v for k, v in preset.items() if k != "like"}
+                if not isinstance(base, str) or base not in whole:
+                    raise _no_such_base(name, base, whole)
+                if isinstance(whole[base], dict):
+                    values = merged(whole[base], values)
             whole[name] = values
         return whole
 
@@ -176,20 +183,35 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     values = dict(base)
     for name, value in over.items():
         below = values.get(name)
-        nested = isinstance(below, dict) and isinstance(value, dict)
-        values[name] = merged(dict(below or {}), value) if nested else value
+        if isinstance(below, dict) and isinstance(value, dict):
+            values[name] = merged(below, value)
+        else:
+            values[name] = value
     return values
 
 
-class Card(Strict):
-    """models/<task>/<recipe>.card.yaml: where a checkpoint comes from and what its data looked like.
+def _no_such_base(name: str, base: Any, above: Iterable[str]) -> ValidationError:
+    """The refusal of `like: base` in the preset `name`, at its own place in the file."""
+    complaint = ValueError(
+        f"expected a preset above it, found {base!r}; above it are: {', '.join(above) or 'none'}"
+    )
+    details = InitErrorDetails(
+        type="value_error", loc=(name, "like"), input=base, ctx={"error": complaint}
+    )
+    return ValidationError.from_exception_data("presets", [details])
 
-    inverse  how well the inverse dynamics model does, R^2: on held-out windows, on random inputs; None where there is none
-    constraints   hash of the constraints that a conditional planner was trained for; None of the others
-    observed      quantities that it is told, besides
-    returns  of a planner conditioned on the return: the discount, the reward a step that is told as -1 and as 1, the share of the
-             states with a label; None of the others
-    linear   share of the data's transitions that linear dynamics explain (kept above 0.99); None where none were fitted
+
+class Card(Strict):
+    """models/<task>/<recipe>.card.yaml: where a checkpoint is from, and facts of its data.
+
+    inverse       R^2 of the inverse dynamics model, on held-out windows and on random inputs; None
+                  without such a model
+    constraints   hash of the constraints that a conditional planner was trained for, else None
+    observed      quantities that the planner is conditioned on
+    returns       of a planner conditioned on the return, else None: the discount, the rewards per
+                  step at the labels -1 and 1, the share of states with a label
+    linear        share of the data's transitions that linear dynamics explain (kept above 0.99);
+                  None where none were fitted
     """
 
     task: str
@@ -218,4 +240,5 @@ class Card(Strict):
 
 
 def load_recipe(task: str) -> Recipe:
+    """The recipe of a task; raises SpecError where it is missing or wrong."""
     return load(shown(home() / "models" / task / "recipe.yaml"), Recipe)

@@ -8,7 +8,7 @@ from itertools import accumulate, pairwise
 
 @dataclass(frozen=True)
 class Schedule:
-    """Noise levels alpha_bar[i] for i = 0 (clean) ... n_steps, and the trained step t[i] each one belongs to.
+    """Noise levels alpha_bar[i] for i = 0 (clean) ... n_steps, each at the trained step t[i].
 
     q(x_t | x_0) = N(sqrt(alpha_bar_t) x_0, (1 - alpha_bar_t) I)
     """
@@ -18,13 +18,13 @@ class Schedule:
 
     @classmethod
     def cosine(cls, n_steps: int) -> "Schedule":
-        """Cosine schedule with offset s = 0.008 and beta at most 0.999 (Nichol and Dhariwal, 2021)."""
+        """Cosine schedule, offset s = 0.008, beta at most 0.999 (Nichol and Dhariwal, 2021)."""
         level = [
             math.cos((i / n_steps + 0.008) / 1.008 * math.pi / 2) ** 2 for i in range(n_steps + 1)
         ]
         alpha_bar = [1.0]
-        for now, before in zip(level[1:], level[:-1], strict=True):
-            alpha_bar.append(alpha_bar[-1] * (1 - min(1 - now / before, 0.999)))
+        for before, after in pairwise(level):
+            alpha_bar.append(alpha_bar[-1] * (1 - min(1 - after / before, 0.999)))
         return cls(tuple(alpha_bar), tuple(range(n_steps + 1)))
 
     @classmethod
@@ -41,6 +41,7 @@ class Schedule:
 
     @property
     def n_steps(self) -> int:
+        """Number of diffusion steps."""
         return len(self.t) - 1
 
     def beta(self, i: int) -> float:
@@ -48,17 +49,17 @@ class Schedule:
         return 1 - self.alpha_bar[i] / self.alpha_bar[i - 1]
 
     def respaced(self, n_steps: int) -> "Schedule":
-        """The same noise range in fewer steps, the noisiest always among them: i_k = n (k / n_steps)^1.5 of n.
+        """The same noise range in fewer steps: i_k = n (k / n_steps)^1.5, which includes n.
 
-        The last step ends at a clean estimate, a mean that has lost the detail below its noise level, so the steps are shorter
-        near the data. 1.5 is ours, by tests/benchmarks/studies/solvers.py: powers 1 (even) and 2 and steps even in log-SNR are worse.
+        The last step ends at a clean estimate, a mean that has lost the detail below its noise
+        level, so the steps are shorter near the data. The power 1.5 is ours, from
+        tests/benchmarks/studies/solvers.py: powers 1 and 2 and steps even in log-SNR are worse.
         """
-        wanted = (round(self.n_steps * (k / n_steps) ** 1.5) for k in range(1, n_steps + 1))
-        keep = list(
-            accumulate(wanted, lambda before, i: max(before + 1, i), initial=0)
-        )  # each step once; convex, so it ends at n
+        rounded = (round(self.n_steps * (k / n_steps) ** 1.5) for k in range(1, n_steps + 1))
+        # each step once; the sequence is convex, so it ends at n
+        keep = list(accumulate(rounded, lambda before, i: max(before + 1, i), initial=0))
         return Schedule(tuple(self.alpha_bar[i] for i in keep), tuple(self.t[i] for i in keep))
 
     def until(self, n_steps: int) -> "Schedule":
-        """The last steps alone, those nearest the data."""
+        """Only the last n_steps steps, those nearest to the data."""
         return Schedule(self.alpha_bar[: n_steps + 1], self.t[: n_steps + 1])

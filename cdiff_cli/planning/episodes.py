@@ -28,7 +28,7 @@ class Episodes:
                       where none was made
     calls             network calls per plan [n, steps]; NaN where none was made
     braked            1 where the input was the fallback action [n, steps]
-    info              numbers that the environment reports beside the reward, by name, each [n, steps]
+    info              numbers that the environment reports besides, by name, each [n, steps]
     fell              whether the environment ended the episode [n]
     diverged          whether it ended because its plan or state was not finite [n]
     latency_s         wall time per planning step, for all episodes together

@@ -15,7 +15,11 @@ from cdiff_cli.errors import CdiffError
 class Rollout:
     """Executed episodes.
 
-    x [n, steps + 1, dim], u [n, steps, m], reward [n, steps], success [n], goal_distance [n] at the end
+    x               states [n, steps + 1, dim]
+    u               inputs as applied [n, steps, m]
+    reward          [n, steps]
+    success         whether the end is within the task's success radius of the last waypoint [n]
+    goal_distance   distance to the last waypoint at the end [n]
     """
 
     x: Array
@@ -33,9 +37,12 @@ def follow(
     on_step: Callable[[int], None] | None = None,
     planned: Array | None = None,
 ) -> Rollout:
-    """Follow each plan in the task's environment with its tracking controller, then hold at the last waypoint.
+    """Follow each plan with the task's tracking controller, then hold at the last waypoint.
 
-    planned   inputs that belong to the plans [n, horizon - 1, m]: fed forward, the controller corrects what they miss
+    hold      steps at the last waypoint
+    planned   inputs of the plans [n, horizon - 1, m]; they are fed forward, and the tracking
+              controller corrects the rest
+    Raises CdiffError where the simulation diverges.
     """
     env = task.make_env().unwrapped
     episodes: list[Mapping[str, Array]] = []

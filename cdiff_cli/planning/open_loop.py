@@ -110,7 +110,7 @@ def plan(
 
 
 def _seen_by_the_method(problem: Problem) -> Constraint:
-    """What the method satisfies, normalised: all but the dynamics, with a clearance where there are any."""
+    """What the method satisfies, normalised: all but the dynamics; with dynamics, a clearance."""
     others, dynamics = split(problem.enforced)
     inside = others.tighten(problem.tolerances.clearance) if dynamics.parts else others
     return _normalised(problem, inside)

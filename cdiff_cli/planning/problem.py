@@ -7,15 +7,15 @@ import torch
 
 from cdiff_cli.arrays import Array
 from cdiff_cli.constraints.pins import Pins
-from cdiff_cli.constraints.rate import RateLimit, refuse_contradiction
-from cdiff_cli.constraints.trajectory import Constraint
+from cdiff_cli.constraints.rate import check_rates
+from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.errors import CdiffError, InfeasibleError
 from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.planner import Planner
 from cdiff_cli.tasks.protocol import HasMap, Task, Tolerances
 
 POLISH_MARGIN = 1e-6
-"""The final projection tightens g by this, environment units; larger than every solver's tolerance."""
+"""Margin of the final projection, environment units; larger than every solver's tolerance."""
 
 
 DEFAULT_TOLERANCES = Tolerances()
@@ -70,19 +70,18 @@ class Problem:
 def check_feasible(problem: Problem, task: Task | None = None) -> None:
     """Refuse a start or goal inside a wall of the task or outside the constraints.
 
-    Raises CdiffError, or InfeasibleError where a constraint is the reason, before anything is sampled.
+    Raises CdiffError, or InfeasibleError where a constraint is the reason.
     """
     for name, states in (("start", problem.start), ("goal", problem.goal)):
         for state in () if states is None else np.atleast_2d(states):
             _check_end(problem, task, name, state)
-    refuse_contradiction([part for part in problem.declared.parts if isinstance(part, RateLimit)])
+    check_rates(problem.declared)
     if problem.start is None or problem.goal is None:
         return
     pins = problem.pins(len(np.atleast_2d(problem.start)), torch.float64, torch.device("cpu"))
-    for part in problem.declared.parts:
-        if isinstance(part, RateLimit):
-            normaliser = problem.normaliser
-            part.pull_back(normaliser.centre, normaliser.scale).refuse_pins(pins, POLISH_MARGIN)
+    normalised = pull_back(problem.declared, problem.normaliser.centre, problem.normaliser.scale)
+    for part in normalised.parts:
+        part.check_pins(pins, POLISH_MARGIN)
 
 
 def _check_end(problem: Problem, task: Task | None, name: str, state: Array) -> None:
@@ -99,7 +98,7 @@ def _check_end(problem: Problem, task: Task | None, name: str, state: Array) -> 
             f"choose a free point of {task.name}"
         )
     for part in problem.declared.parts:
-        level = getattr(part, "level", None)
+        level = part.level
         value = float(level(torch.from_numpy(state))) if level is not None else 0.0
         if value > 0:
             raise InfeasibleError(

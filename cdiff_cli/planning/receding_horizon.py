@@ -203,7 +203,7 @@ def _drop_diverged(
 
 
 class _Disturbance:
-    """Inputs as the environment receives them: with noise of their own stream, within their bounds."""
+    """Inputs as the environment receives them: disturbed, and clipped to their bounds."""
 
     def __init__(self, size: float, seeds: Sequence[int], space: Any) -> None:
         self.size, self.low, self.high = size, space.low, space.high

@@ -43,7 +43,8 @@ class Plan:
     """The plans of one planning step, one per episode.
 
     x            environment units [n, horizon, dim]
-    levels       each declared constraint's value along them, unsafe above 0 [n, horizon, constraints]
+    levels       value of each declared constraint along them, unsafe above 0
+                 [n, horizon, constraints]
     violation    sum of [g]_+ over waypoints and rows, as declared [n]
     infeasible   whether the projection found no plan that satisfies the constraints [n]
     calls        network calls per plan [n]
@@ -112,7 +113,8 @@ class Replanner:
     planner          with an inverse dynamics model
     declared         g as declared: what is scored                    environment units
     method           how sampling satisfies the constraints
-    enforced         what plans satisfy: g tightened by the margins   environment units; None: declared
+    enforced         what plans satisfy, tightened by the margins     environment units;
+                     None: declared
     sampler          kernel, extra steps, temperature, final projection
     control          steps executed per plan, warm start, carried multipliers, disturbance
     fallback_action  state [dim] -> input [m], for a state from which the final projection found no
@@ -174,7 +176,7 @@ class Replanner:
         return self.method.candidates * each
 
     def inputs(self, x: Array, plan: Plan, since: int) -> Array:
-        """Inputs [n, m] that follow the plans from the states x [n, dim], `since` steps into them."""
+        """Inputs [n, m] that follow the plans from x [n, dim], `since` steps into them."""
         inverse = self.planner.inverse_dynamics
         if inverse is None:
             raise CdiffError("the planner has no inverse dynamics; give it one")

@@ -29,16 +29,17 @@ def shift_plan(window: Normaliser, last: NDArray[np.float64], steps: int) -> Ten
 
 
 def carry(method: Method, last: Any, g: Constraint, x: Traj, executed: int) -> Any:
-    """State that the method begins the next plan with: fresh, but with the multipliers that the last plan ended with.
+    """State that the method begins the next plan with, holding the previous plan's multipliers.
 
-    The multipliers move forward by the executed waypoints, block by block, and those of the new waypoints begin at zero.
-    Begun at zero altogether, they would have to be found again in the few steps of a warm-started plan.
-    A penalty weight begins anew. Multipliers of another number of rows or plans are dropped.
+    The multipliers move forward by the executed waypoints, block by block, and those of the new
+    waypoints begin at zero. With all at zero, they would have to be found again in the few steps of
+    a warm-started plan. A penalty weight begins anew. Multipliers for another number of rows or
+    plans are dropped.
 
-    last       state after the last step of the last plan, of the same plans in the same order; None: begin afresh
+    last       state after the last step of the previous plans, in the same order; None: begin anew
     g          the constraint that sample() is given
     x          any tensor of the plans' shape [batch, horizon, dim], type and device
-    executed   waypoints by which the present plan begins later than the last
+    executed   waypoints by which the present plan begins later than the previous one
     """
     fresh = method.init(x, g)
     if isinstance(fresh, AlmState):
@@ -66,7 +67,7 @@ def select(state: Any, plans: NDArray[np.bool_]) -> Any:
 def _moved(
     method: Method, fresh: Rows, last: Any, g: Constraint, horizon: int, executed: int
 ) -> Rows:
-    """The last multipliers moved forward block by block; new rows at the end of a block stay as in `fresh`."""
+    """The previous multipliers moved forward block by block; new rows stay as in `fresh`."""
     if not isinstance(last, torch.Tensor) or last.shape != fresh.shape:
         return fresh
     out = fresh.clone()

@@ -1,10 +1,13 @@
-"""The nearest trajectory on a control-barrier chain, exactly: the values of the barrier h are projected onto
+"""The nearest trajectory that satisfies a discrete barrier, exactly.
 
-    h_{k+1} >= gamma h_k                                                  plain: weighted isotonic regression
-    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0            high-order: a small quadratic program
+The values of the barrier h are projected onto
 
-with the weights that a waypoint's way to another value of h has, then each waypoint moves to its new level set. Half-spaces have
-planes for level sets and balls spheres, so that the nearest point is along the normal and the result is the nearest trajectory.
+    h_{k+1} >= gamma h_k                                         plain: isotonic regression
+    h_{k+2} - (gamma + gamma2) h_{k+1} + gamma gamma2 h_k >= 0   high-order: a small QP
+
+weighted by the distance that a waypoint moves per change of h. Each waypoint then moves to its new
+level set. Level sets of half-spaces are planes and those of balls are spheres, so the nearest point
+is along the normal and the result is the nearest trajectory.
 """
 
 import torch
@@ -18,8 +21,15 @@ from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.projection.solvers.isotonic import nearest_between, powers
 from cdiff_cli.projection.solvers.nonnegative_qp import nonnegative_least
 
-LINEARISED = 12  # times that a barrier is linearised anew; three or four end at rounding
-NUDGE = 1e-18  # added to a direction from a centre, so that the centre itself has one: along the first axis
+MAX_LINEARISATIONS = 12  # linearisations of a barrier; three or four reach rounding
+NUDGE = 1e-18  # added to the first axis, so that the centre of a ball itself has a direction
+
+
+def has_barrier_projection(part: DiscreteBarrier) -> bool:
+    """Whether project_barrier takes the state set of the part."""
+    level = part.acting
+    outside_ball = isinstance(level, Ellipsoid) and level.side == "outside" and level.is_ball
+    return isinstance(level, HalfSpace | BallHOCBF) or outside_ball
 
 
 def project_barrier(chain: DiscreteBarrier, z: Traj, pins: Pins) -> Traj:
@@ -48,27 +58,31 @@ def project_barrier(chain: DiscreteBarrier, z: Traj, pins: Pins) -> Traj:
 
 
 def _by_linearising(chain: DiscreteBarrier, level: BallHOCBF, z: Traj, pins: Pins) -> Traj:
-    """A nearest trajectory to z, by the exact projection onto the chain of the barriers linearised where the last one ended: each
-    moves its waypoint along its gradient there. A local solution; what it ends on satisfies the chain to rounding.
+    """A locally nearest trajectory to z, by projections onto linearised barriers.
+
+    The barrier of each waypoint is linearised at the last iterate, and the waypoint moves along its
+    gradient. The last iterate satisfies the barrier up to rounding.
     """
     x = z
-    for _ in range(LINEARISED):
+    for _ in range(MAX_LINEARISATIONS):
         h = -level(x)
         if not bool((chain.rows_of(-h) > 0).any()) and x is not z:
             break
         slope = -level.gradient(x)
         size = slope.square().sum(-1).clamp_min(1e-30)
-        there = h + (slope * (z - x)).sum(-1)
-        target = _nearest_values(chain, there, 1 / size, None, pins)
-        x = z + ((target - there) / size)[..., None] * slope
+        h_at_z = h + (slope * (z - x)).sum(-1)  # of the linearised barrier
+        target = _nearest_values(chain, h_at_z, 1 / size, None, pins)
+        x = z + ((target - h_at_z) / size)[..., None] * slope
     return x
 
 
 def _nearest_values(
     chain: DiscreteBarrier, h: Rows, weight: Tensor, low: Tensor | None, pins: Pins
 ) -> Rows:
-    """The nearest values to h that the chain allows, those of held waypoints kept; none below `low`, which has the dimensions of
-    a number of the level: h at the centre of a ball.
+    """The nearest values to h that the barrier allows, with those of pinned waypoints kept.
+
+    low   the lowest possible value, h at the centre of a ball: [] or with leading dimensions as a
+          parameter of the state set
     """
     first, last = pins.loose
     if chain.alpha2 is not None:
@@ -82,8 +96,11 @@ def _nearest_values(
 
 
 def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
-    """The lowest chain whose values are nowhere below `low` [], [horizon | 1] or [batch | 1, horizon | 1]: v_k = max over i <= k of
-    gamma^(k - i) low_i. A bound on the first index, which the chain hands on, exact where the balls are all of one size.
+    """The lowest values that satisfy the barrier and are nowhere below `low`.
+
+    v_k = max over i <= k of gamma^(k - i) low_i. This is exact where all balls have the same size.
+
+    low   [], [horizon | 1] or [batch | 1, horizon | 1]
     """
     power = powers(gamma, h.shape[1] - 1, h)
     if low.ndim == 0 or low.shape[-1] == 1:
@@ -93,14 +110,16 @@ def _lowest_chain(low: Tensor, gamma: float, h: Rows) -> Tensor:
     return torch.where(past >= 0, power[past.clamp_min(0)] * low[..., None], -torch.inf).amax(-2)
 
 
-# high-order chains ----------------------------------------------------------------------------------------------------
+# high-order barriers ------------------------------------------------------------------------------
 
 
 def _nearest_under(
     chain: DiscreteBarrier, h: Rows, weight: Tensor, low: Tensor | None, first: int, last: int
 ) -> Rows:
-    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0, v_k = h_k outside first to last, by its dual (_by_dual). Where that asks for
-    less than the centre of a ball has: from there on the least that `low` and D allow, feasible if not the nearest.
+    """min sum_k w_k (v_k - h_k)^2  s.t.  D v >= 0,  v_k = h_k outside first to last, by its dual.
+
+    Where the solution is below `low`, the least values that `low` and D allow replace it: feasible,
+    if not the nearest.
     """
     one, free = torch.eye(h.shape[1], dtype=torch.float64, device=h.device), slice(first, last)
     D, v = chain.rows_of(one).T, h.to(torch.float64, copy=True)
@@ -109,21 +128,20 @@ def _nearest_under(
         order = len(chain.coefficients) - 1
         v = torch.maximum(v, low)
         for k in range(max(first, order), last):
-            due = sum(
-                (
-                    -weight * v[:, k - order + at]
-                    for at, weight in enumerate(chain.coefficients[:-1])
-                ),
+            least = sum(
+                (-c * v[:, k - order + i] for i, c in enumerate(chain.coefficients[:-1])),
                 torch.zeros_like(v[:, 0]),
             )
-            v[:, k] = torch.maximum(v[:, k], due)
+            v[:, k] = torch.maximum(v[:, k], least)
     return v.to(h)
 
 
 def _by_dual(D: Tensor, b: Tensor, way: Tensor) -> Tensor:
-    """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0 [batch, n], for D [r, n], b [batch, r], way [n] or [batch, n], by its dual:
+    """min sum_k d_k^2 / way_k  s.t.  b + D d >= 0, by its dual: d [batch, n].
 
-    d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
+        d = way D^T lam,   lam >= 0,   b + Q lam >= 0,   lam (b + Q lam) = 0,   Q = D way D^T
+
+    D [r, n], b [batch, r], way [n] or [batch, n]
     """
     Q = (D * way[..., None, :]) @ D.T
     return (nonnegative_least(Q, -b, 1e-12 * (1 + b.abs().amax(1, keepdim=True))) @ D) * way

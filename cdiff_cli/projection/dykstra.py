@@ -7,32 +7,36 @@ import torch
 from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
-from cdiff_cli.projection.sequential_qp import _free_rows
+from cdiff_cli.projection.sequential_qp import free_rows
 
-DYKSTRA_ROUNDS = 200  # of Dykstra's algorithm before sequential linearisation takes over
+MAX_ROUNDS = 200  # rounds over all sets before the next strategy is tried
 
 
-def _dykstra(
+def dykstra(
     g: Constraint,
-    onto: Sequence[Callable[[Traj], Traj]],
+    projections: Sequence[Callable[[Traj], Traj]],
     z: Traj,
     pins: Pins,
     tolerance: float,
     corrected: bool = True,
 ) -> Traj:
-    """Dykstra's algorithm over projections onto sets whose intersection is g: the projection onto it where they are convex; on
-    others a heuristic that is checked. Uncorrected it is plain alternation, which ends at some point of the intersection.
+    """The projection of z onto an intersection of convex sets, by projections onto each of them.
+
+    For sets that are not convex the result is a heuristic and must be checked.
+
+    g           the constraint that describes the intersection; the rounds end when it is satisfied
+    corrected   False: alternating projections, which end at some point of the intersection
     """
-    x, left = z, [torch.zeros_like(z) for _ in onto]
-    for _ in range(DYKSTRA_ROUNDS):
+    x, corrections = z, [torch.zeros_like(z) for _ in projections]
+    for _ in range(MAX_ROUNDS):
         before = x
-        for i, nearest_of in enumerate(onto):
-            y = nearest_of(x + left[i])
+        for i, projection in enumerate(projections):
+            y = projection(x + corrections[i])
             if corrected:
-                left[i] = x + left[i] - y
+                corrections[i] = x + corrections[i] - y
             x = y
         if float((x - before).abs().max()) <= tolerance / 10 and bool(
-            (_free_rows(g, x, pins) <= tolerance).all()
+            (free_rows(g, x, pins) <= tolerance).all()
         ):
             break
     return x

@@ -1,8 +1,9 @@
-"""The nearest trajectory within limits on rates: ADMM on the differences between waypoints."""
+"""The nearest trajectory within limits on rates, by ADMM on the differences between waypoints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,88 +12,130 @@ from cdiff_cli.arrays import Traj
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.rate import RateLimit
 
-ROUNDS = 6000  # of ADMM at most; from nothing to 1e-9 it takes 1300 to 2000 on the mazes' plans
-RELAXATION = 1.7
+MAX_ROUNDS = 6000  # rounds of ADMM; 1300 to 2000 reach 1e-9 on plans of the mazes from a cold start
+RELAXATION = 1.7  # over-relaxation of ADMM
+CHECKED = 5  # rounds between two tests for convergence
+CONVERGED = {
+    torch.float64: 1e-10,
+    torch.float32: 1e-6,
+}  # change per round at the end, environment units
 
 
 @dataclass
 class RateProjection:
-    """The projection onto limits with the same pins, again and again: each call begins where the last one ended.
+    """The projection onto limits, for many calls with the same pins: each starts from the last one.
 
-    parts  of one frame, as those of a constraint are
-    warm   by group of limits that was not obeyed: copies of the differences and their scaled multipliers, the limits' one after
-           another   [k, horizon - 1, batch]
+    parts      limits on trajectories in one frame
+    previous   per group of coupled limits that were violated: the copies of the differences and
+               their scaled multipliers, one limit after another   [k, horizon - 1, batch]
     """
 
     parts: Sequence[RateLimit]
     pins: Pins
-    warm: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    previous: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     def __call__(self, z: Traj) -> Traj:
         """The nearest trajectory to z within the limits."""
         for i, group in enumerate(coupled(self.parts)):
-            z = self._onto(i, group, z)
+            z = self._onto_group(i, group, z)
         return z
 
-    def _onto(self, i: int, parts: Sequence[RateLimit], z: Traj) -> Traj:
-        batch, horizon, _ = z.shape
-        if horizon < 2 or (
-            i not in self.warm and not any(bool((part(z) > 0).any()) for part in parts)
-        ):
+    def _onto_group(self, i: int, parts: Sequence[RateLimit], z: Traj) -> Traj:
+        """The nearest trajectory to z within the i-th group of coupled limits."""
+        if z.shape[1] < 2:
             return z
-        scale, centre = parts[0].scale, parts[0].centre
-        if scale.ndim == 3 and len(scale) > 1:
-            return torch.cat([_alone(parts, self.pins, z, b) for b in range(batch)])
-        limited = torch.cat([part.which for part in parts]).argmax(1).tolist()
-        columns = list(dict.fromkeys(limited))
-        of = torch.tensor(
-            [columns.index(c) for c in limited], device=z.device
-        )  # the column of each copy
-        scale, centre = scale[..., columns], centre[..., columns]
-        each = torch.split(of, [len(part.which) for part in parts])
-        weight = scale.reshape(-1, len(columns)).expand(horizon, -1).T.square().reciprocal()
-        held = self.pins.mask[:, columns].T
-        listed = (
-            tuple(map(tuple, v))
-            for v in (held.tolist(), weight.tolist(), [w.tolist() for w in each])
-        )
-        inverse, M = _solver(*listed, z.dtype, z.device)
-        single = len(parts) == 1
-        target = (centre + scale * z[..., columns]).permute(2, 1, 0)
-        base = torch.where(held[..., None], target, 0.0)
-        still, toward = base.diff(dim=1)[of], base + inverse @ (weight[..., None] * target)
-        step = target.diff(dim=1)[of]
-        copy, dual = self.warm.get(i) or (_cut(parts, step), torch.zeros_like(step))
-        close, x = 1e-10 if z.dtype == torch.float64 else 1e-6, target
-        for k in range(ROUNDS):
-            pushed = M @ (copy - dual - still)
-            x = toward + pushed if single else toward.index_add(0, of, pushed)
-            made = x.diff(dim=1) if single else x.diff(dim=1)[of]
-            over = RELAXATION * made + (1 - RELAXATION) * copy + dual
-            before, copy = copy, _cut(parts, over)
-            dual = over - copy
-            if (
-                k % 5 == 4
-                and max(float((made - copy).abs().max()), float((copy - before).abs().max()))
-                < close
-            ):
-                break
-        self.warm[i] = copy, dual
+        if i not in self.previous and not any(bool((part(z) > 0).any()) for part in parts):
+            return z
+        if parts[0].scale.ndim == 3 and len(parts[0].scale) > 1:
+            return torch.cat([_single(parts, self.pins, z, b) for b in range(len(z))])
+        problem = _differences(parts, self.pins, z)
+        x, copy, dual = _admm(parts, problem, self.previous.get(i), CONVERGED[z.dtype])
+        self.previous[i] = copy, dual
         out = z.clone()
-        out[..., columns] += (x - target).permute(2, 1, 0) / scale
+        out[..., problem.columns] += (x - problem.target).permute(2, 1, 0) / problem.scale
         return out
 
 
-def _cut(parts: Sequence[RateLimit], change: Tensor) -> Tensor:
-    """Changes, the limits' one after another, each brought within its own."""
+class Differences(NamedTuple):
+    """The problem min |x - target|^2 s.t. limits on differences of x, per column and waypoint.
+
+    columns     coordinates that are limited                     c of them
+    scale       environment units per unit of z                  [..., c]
+    target      in environment units                             [c, horizon, batch]
+    column_of   the column of each copy                          [k]
+    base        target at pinned waypoints, 0 elsewhere          [c, horizon, batch]
+    inverse     see _solver                                      [c, horizon, horizon]
+    pushes      see _solver                                      [k, horizon, horizon - 1]
+    weight      weight per column and waypoint in the distance   [c, horizon]
+    """
+
+    columns: list[int]
+    scale: Tensor
+    target: Tensor
+    column_of: Tensor
+    base: Tensor
+    inverse: Tensor
+    pushes: Tensor
+    weight: Tensor
+
+
+def _differences(parts: Sequence[RateLimit], pins: Pins, z: Traj) -> Differences:
+    """The problem of one group of coupled limits."""
+    limited = torch.cat([part.which for part in parts]).argmax(1).tolist()
+    columns = list(dict.fromkeys(limited))
+    index = torch.tensor([columns.index(c) for c in limited], device=z.device)
+    scale, centre = parts[0].scale[..., columns], parts[0].centre[..., columns]
+    weight = scale.reshape(-1, len(columns)).expand(z.shape[1], -1).T.square().reciprocal()
+    held = pins.mask[:, columns].T
+    per_limit = [w.tolist() for w in torch.split(index, [len(part.which) for part in parts])]
+    listed = (tuple(map(tuple, v)) for v in (held.tolist(), weight.tolist(), per_limit))
+    inverse, pushes = _solver(*listed, z.dtype, z.device)
+    target = (centre + scale * z[..., columns]).permute(2, 1, 0)
+    base = torch.where(held[..., None], target, 0.0)
+    return Differences(columns, scale, target, index, base, inverse, pushes, weight)
+
+
+def _admm(
+    parts: Sequence[RateLimit],
+    problem: Differences,
+    previous: tuple[Tensor, Tensor] | None,
+    converged: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The nearest x [c, horizon, batch], the copies of its differences and scaled multipliers."""
+    _, _, target, index, base, inverse, pushes, weight = problem
+    single = len(parts) == 1
+    fixed, toward = base.diff(dim=1)[index], base + inverse @ (weight[..., None] * target)
+    change = target.diff(dim=1)[index]
+    copy, dual = previous or (_nearest_changes(parts, change), torch.zeros_like(change))
+    x = target
+    for k in range(1, MAX_ROUNDS + 1):
+        push = pushes @ (copy - dual - fixed)
+        x = toward + push if single else toward.index_add(0, index, push)
+        change = x.diff(dim=1) if single else x.diff(dim=1)[index]
+        relaxed = RELAXATION * change + (1 - RELAXATION) * copy + dual
+        last, copy = copy, _nearest_changes(parts, relaxed)
+        dual = relaxed - copy
+        if k % CHECKED == 0:
+            miss, moved = (change - copy).abs().max(), (copy - last).abs().max()
+            if max(float(miss), float(moved)) < converged:
+                break
+    return x, copy, dual
+
+
+def _nearest_changes(parts: Sequence[RateLimit], change: Tensor) -> Tensor:
+    """The nearest changes within the limits, one limit after another along the first dimension."""
     if len(parts) == 1:
-        return parts[0].cut(change)
+        return parts[0].nearest_change(change)
     each = torch.split(change, [len(part.which) for part in parts])
-    return torch.cat([part.cut(one) for part, one in zip(parts, each, strict=True)])
+    near = [part.nearest_change(one) for part, one in zip(parts, each, strict=True)]
+    return torch.cat(near)
 
 
 def coupled(parts: Sequence[RateLimit]) -> list[list[RateLimit]]:
-    """The limits in groups of which no two share a coordinate: their projections, one after another, are then that onto all."""
+    """The limits in groups that share no coordinate.
+
+    The projections onto the groups, one after another, are the projection onto all limits.
+    """
     groups: list[list[RateLimit]] = []
     for part in parts:
         meeting = [
@@ -106,8 +149,8 @@ def coupled(parts: Sequence[RateLimit]) -> list[list[RateLimit]]:
     return groups
 
 
-def _alone(parts: Sequence[RateLimit], pins: Pins, z: Traj, b: int) -> Traj:
-    """The projection of one plan of a batch whose frames differ."""
+def _single(parts: Sequence[RateLimit], pins: Pins, z: Traj, b: int) -> Traj:
+    """The projection of plan b of a batch whose frames differ."""
     which = torch.tensor([b], device=z.device)
     return RateProjection(
         [part.select(which) for part in parts], Pins(pins.mask, pins.values[which])
@@ -122,20 +165,26 @@ def _solver(
     dtype: torch.dtype,
     device: torch.device,
 ) -> tuple[Tensor, Tensor]:
-    """For the nearest trajectory to targets and copies together: the inverse of W + (sum of rho over the limits) D^T D over the
-    free waypoints, zero elsewhere, of each column; and, of each copy, that of its column times rho D^T, [., horizon, .]. D takes
-    differences, W holds the weights of the waypoints in the distance, `limited` the columns of each limit. rho grows with the
-    square of the horizon, as the time that a change takes from one end to the other.
+    """The matrices of the nearest trajectory to targets and copies together.
+
+    Per column the inverse of W + sum(rho) D^T D over the free waypoints, zero elsewhere, with the
+    sum over the limits on that column. Per copy this inverse times rho D^T. D takes differences and
+    W holds the weights of the waypoints in the distance. rho grows with the square of the horizon,
+    as the number of rounds does that a change takes from one end to the other.
+
+    held      whether each waypoint is pinned      per column
+    weight    weight of each waypoint              per column
+    limited   indices of the columns               per limit
     """
     fixed, w = torch.tensor(held), torch.tensor(weight, dtype=torch.float64)
     count, horizon = w.shape
     D = torch.eye(horizon, dtype=torch.float64).diff(dim=0)
-    rho = [float(w[list(own)].mean()) * max(1.0, (horizon / 20) ** 2) for own in limited]
-    total = [sum(r for r, own in zip(rho, limited, strict=True) if c in own) for c in range(count)]
+    rho = [float(w[list(cs)].mean()) * max(1.0, (horizon / 20) ** 2) for cs in limited]
+    total = [sum(r for r, cs in zip(rho, limited, strict=True) if c in cs) for c in range(count)]
     inverse = torch.zeros(count, horizon, horizon, dtype=torch.float64)
     for c in range(count):
         free = (~fixed[c]).nonzero()[:, 0]
         A = total[c] * D.T @ D + w[c].diag()
         inverse[c, free[:, None], free] = torch.linalg.inv(A[free[:, None], free])
-    pushes = torch.cat([r * inverse[list(own)] @ D.T for r, own in zip(rho, limited, strict=True)])
+    pushes = torch.cat([r * inverse[list(cs)] @ D.T for r, cs in zip(rho, limited, strict=True)])
     return inverse.to(device, dtype), pushes.to(device, dtype)

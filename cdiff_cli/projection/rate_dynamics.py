@@ -1,11 +1,12 @@
-"""The nearest trajectory that linear dynamics with bounded inputs make within limits on rates, around obstacles, the whole batch
-at once.
+"""The nearest trajectory that linear dynamics produce within limits on rates, around obstacles.
 
-    minimise |x - z|^2_W   s.t.  x' = A x + B u + c,  low <= u <= high,  limits on x' - x,  a.x <= b at waypoints,  pins
+    minimise |x - z|^2_W   s.t.   x' = A x + B u + c,   low <= u <= high,   limits on x' - x,
+                                  a.x <= b at waypoints,   pins
 
-A limit on a rate acts on the state and inputs of its step, since the dynamics say what they change: as convex limits of each
-waypoint all of them are solved together (interior_point.py). Obstacles are half-spaces of tangent planes, chosen anew at each result.
-Where no trajectory is within all limits, goals give way first.
+All plans of a batch are solved at once. The dynamics express x' - x by the state and inputs of a
+step, so a limit on a rate is a convex limit at one waypoint, and all limits are solved together
+(interior_point.py). Obstacles are replaced by tangent half-spaces, chosen anew at each solution
+(segments.py). Where no trajectory satisfies all limits, goals give way first.
 """
 
 import math
@@ -20,66 +21,20 @@ from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.rate import RateLimit
-from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import HalfSpace
-from cdiff_cli.constraints.trajectory import Constraint, TrajectoryConstraint
-from cdiff_cli.constraints.waypoints import AtWaypoints
-from cdiff_cli.projection.segments import NEVER, planes
+from cdiff_cli.constraints.trajectory import TrajectoryConstraint
+from cdiff_cli.projection.segments import Obstacle, Plans, TangentChoice, around_obstacles, crossed
+from cdiff_cli.projection.solvers.half_spaces import NEVER, HalfSpaces
 from cdiff_cli.projection.solvers.interior_point import YIELDING, ConicLimits, solve
 
 StepLimit = RateLimit | DiscreteBarrier
-MISSED = 1e-4  # of a limit, in shares of it, metres of a half-space: from there on they contradict each other
-
-
-def project_rate_dynamics(
-    dynamics: LinearDynamics,
-    parts: Sequence[AtWaypoints | OnSegments],
-    paces: Sequence[StepLimit],
-    z: Traj,
-    pins: Pins,
-    *,
-    used: Sequence[int],
-    weight: Tensor,
-    turns: int,
-    tolerance: float,
-    begin: Traj | None = None,
-) -> tuple[Traj, Tensor]:
-    """The trajectory nearest to z, |x - z|^2 weighted by coordinate, that the dynamics produce from the first state of z within all
-    limits, a pinned last state reached; and its inputs [batch, horizon - 1, m].
-
-    parts, paces  act on the coordinates `used` alone, in the units of z
-    weight        of each coordinate in the distance   [n]
-    turns         times at most that tangent planes are chosen, first at `begin`, or z
-    tolerance     violation of a part up to which its planes are not chosen anew
-    """
-    if len(z) == 0 or z.shape[1] == 1:
-        return z, dynamics.inputs(z)
-    where, last = list(used), pins.mask[-1]
-    held, g = Pins(pins.mask[:, where], z[..., where]), Constraint(tuple(parts))
-    free = ~held.mask.any(1)[:, None]
-    x, u = (z if begin is None else begin).clone(), dynamics.inputs(z)
-    always, walls = _always(dynamics, paces, where, z.shape[1]), _none(parts, z, u)
-    todo = torch.ones(len(z), dtype=torch.bool, device=z.device)
-    touched, walled = (g(x[..., where]) > 0).any(1), ~todo
-    for turn in range(turns + 1):
-        if bool(touched.any()):
-            near = [part.select(touched.nonzero()[:, 0]) for part in parts]
-            a, b = planes(near, x[touched][..., where], Pins(held.mask, held.values[touched]))
-            there, slope = free & (b < NEVER), torch.zeros_like(walls.L[touched])
-            slope[:, :, :, 0, where] = torch.where(there[..., None], -a, 0.0)
-            walls.L[touched], walls.o[touched] = slope, torch.where(there, b, 1.0)[..., None]
-        walled = walled | touched
-        limits = [*always, ConicLimits(walls.L[todo], walls.o[todo])] if parts else always
-        x[todo], u[todo] = _within(dynamics, limits, z[todo], weight, last)
-        unsafe = (g(x[..., where]) > tolerance).any(1)
-        todo = touched = unsafe & ~walled | walled & (turn + 1 < turns)
-        if not bool(todo.any()):
-            break
-    return x, u
+INFEASIBLE_ABOVE = (
+    1e-4  # violation that counts as infeasible: share of a limit, or environment units
+)
 
 
 def limits_steps(part: TrajectoryConstraint) -> TypeGuard[StepLimit]:
-    """Whether what the part asks is a convex limit of each step: of the two states that it joins."""
+    """Whether the part is a convex limit on each step, that is on the two states that it joins."""
     if isinstance(part, DiscreteBarrier):
         return (
             part.alpha2 is None and isinstance(part.acting, HalfSpace) and part.acting.a.ndim == 1
@@ -87,33 +42,78 @@ def limits_steps(part: TrajectoryConstraint) -> TypeGuard[StepLimit]:
     return isinstance(part, RateLimit) and part.scale.ndim == 1
 
 
-def bounds_only(pins: Pins) -> bool:
-    """Whether the pins are the start and perhaps the goal, as nearest_slowed takes them."""
+def only_ends(pins: Pins) -> bool:
+    """Whether the pins are the start and perhaps the goal, as project_rates takes them."""
     return pins.whole and bool(pins.held[:1].all()) and not bool(pins.held[1:-1].any())
 
 
-def project_rates(
-    parts: Sequence[AtWaypoints | OnSegments],
-    paces: Sequence[StepLimit],
+def project_rate_dynamics(
+    dynamics: LinearDynamics,
+    parts: Sequence[Obstacle],
+    limits: Sequence[StepLimit],
     z: Traj,
     pins: Pins,
-    turns: int = 0,
+    *,
+    columns: Sequence[int],
+    weight: Tensor,
+    max_choices: int,
+    tolerance: float,
+    start: Traj | None = None,
+) -> tuple[Traj, Tensor]:
+    """The nearest trajectory to z that the dynamics produce from its first state within all limits.
+
+    A pinned last state is reached. Also returns the inputs [batch, horizon - 1, m].
+
+    parts, limits   act on the coordinates `columns` alone, in the units of z
+    weight          weight per coordinate in |x - z|^2   [n]
+    max_choices     how often tangent half-spaces are chosen, first at `start`, or z
+    tolerance       violation of a part that is accepted without a new choice
+    """
+    if len(z) == 0 or z.shape[1] == 1:
+        return z, dynamics.inputs(z)
+    used, last = list(columns), pins.mask[-1]
+    held = Pins(pins.mask[:, used], z[..., used])
+    free = ~held.held[:, None]
+    x, u = z.clone(), dynamics.inputs(z)
+    fixed_limits = _step_limits(dynamics, limits, used, z.shape[1])
+    width = z.shape[2] + u.shape[2]
+
+    def solve_plans(half_spaces: HalfSpaces, plans: Tensor) -> tuple[Traj, Plans]:
+        near = half_spaces.select(plans)
+        conic = [*fixed_limits, _conic(near, free, used, width)] if parts else fixed_limits
+        x[plans], u[plans] = _within(dynamics, conic, z[plans], weight, last)
+        return x[plans][..., used], torch.zeros_like(plans, dtype=torch.bool)
+
+    first = (z if start is None else start)[..., used]
+    choice = TangentChoice.none(parts, first, held)
+    unsafe = crossed(parts, first)
+    around_obstacles(solve_plans, choice, first, unsafe, max_choices, tolerance)
+    return x, u
+
+
+def project_rates(
+    parts: Sequence[Obstacle],
+    limits: Sequence[StepLimit],
+    z: Traj,
+    pins: Pins,
+    max_choices: int = 0,
 ) -> Traj:
-    """The trajectory nearest to z within the limits and around obstacles, of no dynamics: x' = x + u, of any u, makes every one."""
+    """The nearest trajectory to z within the limits and around obstacles, without dynamics.
+
+    The dynamics x' = x + u with unbounded inputs u produce every trajectory.
+    """
     wide = pins.paint(z).double()
-    one, none = (
-        torch.eye(z.shape[2], dtype=wide.dtype, device=wide.device),
-        wide.new_zeros(z.shape[2]),
-    )
+    one = torch.eye(z.shape[2], dtype=wide.dtype, device=wide.device)
+    zero = wide.new_zeros(z.shape[2])
     x, _ = project_rate_dynamics(
-        LinearDynamics(one, one, none, none - torch.inf, none + torch.inf),
+        LinearDynamics(one, one, zero, zero - torch.inf, zero + torch.inf),
         [part.to(wide) for part in parts],
-        [pace.to(wide) for pace in paces],
+        [limit.to(wide) for limit in limits],
         wide,
         Pins(pins.mask, wide),
-        used=range(z.shape[2]),
-        weight=none + 1,
-        turns=turns,
+        columns=range(z.shape[2]),
+        weight=zero + 1,
+        max_choices=max_choices,
         tolerance=1e-9,
     )
     return pins.paint(x.to(z))
@@ -122,66 +122,113 @@ def project_rates(
 def _within(
     dynamics: LinearDynamics, limits: Sequence[ConicLimits], z: Tensor, weight: Tensor, end: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The nearest trajectories within the limits, and their inputs; where there are none, goals and then limits give way."""
+    """The nearest trajectories within the limits, and their inputs.
+
+    Where there are none, goals give way, then limits.
+    """
     n, u = z.shape[2], 0.5 * dynamics.inputs(z)
-    begin = torch.cat((dynamics.rollout(z[:, 0], u), torch.nn.functional.pad(u, (0, 0, 0, 1))), 2)
-    q = solve(dynamics.A, dynamics.B, limits, z, weight, begin, end)
+    start = torch.cat((dynamics.rollout(z[:, 0], u), torch.nn.functional.pad(u, (0, 0, 0, 1))), 2)
+    q = solve(dynamics.A, dynamics.B, limits, z, weight, start, end)
     missed = torch.where(end, q[:, -1, :n] - z[:, -1], 0.0).abs().amax(1)
     missed = torch.stack((missed, *(each.missed(q) for each in limits))).amax(0)
-    soft = ~(missed < MISSED)
-    if bool(soft.any()):
-        some = [each.select(soft) if len(z) > 1 else each for each in limits]
-        q[soft] = solve(dynamics.A, dynamics.B, some, z[soft], weight, begin[soft], end, YIELDING)
+    infeasible = ~(missed < INFEASIBLE_ABOVE)
+    if bool(infeasible.any()):
+        some = [each.select(infeasible) if len(z) > 1 else each for each in limits]
+        q[infeasible] = solve(
+            dynamics.A,
+            dynamics.B,
+            some,
+            z[infeasible],
+            weight,
+            start[infeasible],
+            end,
+            YIELDING,
+        )
     return q[..., :n], q[:, :-1, n:]
 
 
-def _none(parts: Sequence[AtWaypoints | OnSegments], x: Tensor, u: Tensor) -> ConicLimits:
-    """As many half-spaces a waypoint as planes() makes of the parts, none of them there yet."""
-    count = sum(1 if isinstance(part.level, HalfSpace) else 2 for part in parts)
-    shape = (*x.shape[:2], count, 1)
-    return ConicLimits(x.new_zeros(*shape, x.shape[2] + u.shape[2]), x.new_ones(shape))
+def _conic(half_spaces: HalfSpaces, free: Tensor, columns: list[int], width: int) -> ConicLimits:
+    """The half-spaces b - a.x >= 0 as limits on states and inputs.
+
+    free      waypoints that are not pinned; other half-spaces are left out   [horizon, 1]
+    columns   coordinates of the state that the half-spaces act on
+    width     number of states and inputs n + m
+    """
+    a, b = half_spaces
+    active = free & (b < NEVER)
+    L = a.new_zeros(*b.shape, 1, width)
+    L[..., 0, columns] = torch.where(active[..., None], -a, 0.0)
+    return ConicLimits(L, torch.where(active, b, 1.0)[..., None])
 
 
-def _always(
-    dynamics: LinearDynamics, paces: Sequence[StepLimit], used: list[int], horizon: int
+Row = tuple[Tensor, Tensor]
+"""Rows L q + o >= 0 of a step's state and inputs q: L [r, n + m], o [r]."""
+
+
+def _step_limits(
+    dynamics: LinearDynamics, limits: Sequence[StepLimit], columns: list[int], horizon: int
 ) -> list[ConicLimits]:
-    """Inputs within their bounds, in shares of half their range, with chains and the rates of single coordinates; lengths of rates.
-    Rates in shares of their larger limit.
+    """The bounds of the inputs, barriers and rates of single coordinates; then lengths of rates.
+
+    Inputs are in units of half their range, rates in units of their larger limit.
     """
     n, m = dynamics.B.shape
-    one, half = (
-        torch.eye(n + m, dtype=dynamics.A.dtype, device=dynamics.A.device),
-        (dynamics.high - dynamics.low) / 2,
-    )
-    after = torch.cat((dynamics.A, dynamics.B), 1)[used]
-    rows = [
+    one = torch.eye(n + m, dtype=dynamics.A.dtype, device=dynamics.A.device)
+    half = (dynamics.high - dynamics.low) / 2
+    rows: list[Row] = [
         (-one[n:] / half[:, None], dynamics.high / half),
         (one[n:] / half[:, None], -dynamics.low / half),
     ]
     lengths = []
-    for pace in paces:
-        if isinstance(pace, DiscreteBarrier):
-            level, kept = cast(HalfSpace, pace.acting), 1 - pace.alpha
-            rows.append(
-                (
-                    (level.a @ (kept * one[used] - after))[None],
-                    (pace.alpha * level.b - level.a @ dynamics.c[used])[None],
-                )
-            )
-            continue
-        size = max((abs(v) for v in (pace.low, pace.high) if math.isfinite(v)), default=0.0) or 1.0
-        S = pace.which * pace.scale / (pace.dt * size)
-        L, o = S @ (after - one[used]), S @ dynamics.c[used]
-        if pace.norm:
-            lengths.append(
-                (
-                    torch.cat((torch.zeros_like(L[:1]), L))[None],
-                    torch.cat((o.new_tensor([pace.high / size]), o))[None],
-                )
-            )
+    for limit in limits:
+        if isinstance(limit, DiscreteBarrier):
+            rows.append(_barrier_row(dynamics, limit, one[columns], columns))
+        elif limit.norm:
+            lengths.append(_rate_length(dynamics, limit, one[columns], columns))
         else:
-            rows += [(-L, pace.high / size - o), (L, o - pace.low / size)]
+            rows += _rate_rows(dynamics, limit, one[columns], columns)
     L, o = (torch.cat(v) for v in zip(*rows, strict=True))
-    there = o.isfinite()
-    single = [(L[there][:, None], o[there][:, None])] if bool(there.any()) else []
+    finite = o.isfinite()
+    single = [(L[finite][:, None], o[finite][:, None])] if bool(finite.any()) else []
     return [ConicLimits(*each).of_steps(horizon) for each in (*single, *lengths)]
+
+
+def _next_state(dynamics: LinearDynamics, columns: list[int]) -> Tensor:
+    """The matrix from state and inputs to the next state's `columns`, without c [k, n + m]."""
+    return torch.cat((dynamics.A, dynamics.B), 1)[columns]
+
+
+def _barrier_row(
+    dynamics: LinearDynamics, barrier: DiscreteBarrier, state: Tensor, columns: list[int]
+) -> Row:
+    """h' - (1 - alpha) h >= 0 of a half-space."""
+    level, kept = cast(HalfSpace, barrier.acting), 1 - barrier.alpha
+    L = (level.a @ (kept * state - _next_state(dynamics, columns)))[None]
+    return L, (barrier.alpha * level.b - level.a @ dynamics.c[columns])[None]
+
+
+def _rate(
+    dynamics: LinearDynamics, limit: RateLimit, state: Tensor, columns: list[int]
+) -> tuple[float, Tensor, Tensor]:
+    """The larger of the limits, or 1, and the rate L q + o in its units."""
+    sizes = (abs(v) for v in (limit.low, limit.high) if math.isfinite(v))
+    size = max(sizes, default=0.0) or 1.0
+    S = limit.which * limit.scale / (limit.dt * size)
+    return size, S @ (_next_state(dynamics, columns) - state), S @ dynamics.c[columns]
+
+
+def _rate_rows(
+    dynamics: LinearDynamics, limit: RateLimit, state: Tensor, columns: list[int]
+) -> list[Row]:
+    """low <= rate <= high of one coordinate."""
+    size, L, o = _rate(dynamics, limit, state, columns)
+    return [(-L, limit.high / size - o), (L, o - limit.low / size)]
+
+
+def _rate_length(
+    dynamics: LinearDynamics, limit: RateLimit, state: Tensor, columns: list[int]
+) -> tuple[Tensor, Tensor]:
+    """The second-order cone |rate| <= high: L [1, k + 1, n + m], o [1, k + 1]."""
+    size, L, o = _rate(dynamics, limit, state, columns)
+    high = o.new_tensor([limit.high / size])
+    return torch.cat((torch.zeros_like(L[:1]), L))[None], torch.cat((high, o))[None]

@@ -1,11 +1,18 @@
-"""The nearest state that a level allows, exactly."""
+"""The nearest state in a state set, exactly."""
 
 import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import dot, times
-from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame, StateSet
+from cdiff_cli.constraints.protocol import StateSet
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame
+from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
+
+
+def has_state_projection(part: AtWaypoints) -> bool:
+    """Whether project_state takes the state set of the part."""
+    return isinstance(part.level, HalfSpace | Quadric | QuadricInFrame | Ellipsoid)
 
 
 def project_state(level: StateSet, z: Tensor) -> Tensor:
@@ -20,14 +27,14 @@ def project_state(level: StateSet, z: Tensor) -> Tensor:
 
 
 def _nearest_ball(ball: Ellipsoid, z: Tensor) -> Tensor:
-    """Radially to the sphere; a point at the very centre goes along the first axis."""
+    """The nearest point of the sphere; the centre itself moves along the first axis."""
     inner = times(z, ball.which.mT)
     radial, radius = inner - ball.centre, ball.axes[..., :1]
     length = radial.norm(dim=-1, keepdim=True)
     first = torch.zeros_like(radial)
     first[..., 0] = 1.0
     unit = torch.where(length > 1e-12, radial / length.clamp_min(1e-12), first)
-    wrong = length < radius if ball.side > 0 else length > radius
+    wrong = length < radius if ball.side == "outside" else length > radius
     moved = torch.where(wrong, ball.centre + radius * unit, inner)
     return z + times(moved - inner, ball.which)
 
@@ -35,18 +42,18 @@ def _nearest_ball(ball: Ellipsoid, z: Tensor) -> Tensor:
 def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
     """min |x - z|^2 s.t. x.P x + q.x <= r, for P of any signature, by its scalar secular equation.
 
-    In the eigenbasis of P stationarity reads y(mu) = (y0 - mu q / 2) / (1 + mu lambda); f(y(mu)) falls on
-    0 <= mu < -1 / min(lambda), and its root there is the global minimiser (S-lemma). Bisection in float64.
+    In the eigenbasis of P the stationary points are y(mu) = (y0 - mu q / 2) / (1 + mu lambda).
+    f(y(mu)) decreases on 0 <= mu < -1 / min(lambda), and its root is the global minimiser
+    (S-lemma). The root is found by bisection in float64.
     """
     wrong = quadric(z) > 0
     if not bool(wrong.any()):
         return z
-    P, q, r = _of_states(quadric, wrong)
+    P, q, r = _parameters_of(quadric, wrong)
     eigenvalue, basis = torch.linalg.eigh(P)
     y0, q = times(z[wrong].double(), basis), times(q, basis)
-    lowest = eigenvalue[
-        ..., 0
-    ]  # where it is below 0, f has a stationary point, and there its root would be missed: step off it
+    # With a negative lowest eigenvalue, bisection fails at the stationary point of f: step off it.
+    lowest = eigenvalue[..., 0]
     stuck = (lowest < 0) & (
         (2 * y0[:, 0] * lowest + q[..., 0]).abs() < 1e-9 * eigenvalue.abs().amax(-1)
     )
@@ -69,7 +76,8 @@ def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
         high = torch.where(short, 4 * high, high)
     if bool((f(high) > 1e-6 * (1 + r.abs())).any()):
         raise InfeasibleError(
-            "a quadratic constraint has no feasible point at all: x.P x + q.x never falls to r; raise r"
+            "a quadratic constraint has no feasible point at all: x.P x + q.x never falls to r;"
+            " raise r"
         )
     for _ in range(100):
         middle = (low + high) / 2
@@ -80,8 +88,8 @@ def _nearest_quadric(quadric: Quadric, z: Tensor) -> Tensor:
     return out
 
 
-def _of_states(quadric: Quadric, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """P, q, r in float64 of some states of a batch; those that all states share as they are."""
+def _parameters_of(quadric: Quadric, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """P, q, r in float64 of some states of a batch; shared parameters stay single."""
     P, q, r = (v.double() for v in (quadric.P, quadric.q, quadric.r))
     return (
         P if P.ndim == 2 else P.expand(*which.shape, *P.shape[-2:])[which],

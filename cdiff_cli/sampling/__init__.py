@@ -1,4 +1,4 @@
-"""The methods and kernels by name; their modules are imported only when one is used, so that the names need no torch."""
+"""Methods and kernels by name. Their modules are imported on first use: the names need no torch."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
@@ -23,7 +23,10 @@ METHODS = {
     "primal-dual": "cdiff_cli.sampling.clean_methods:CleanPrimalDual",
     "alm": "cdiff_cli.sampling.clean_methods:CleanAugmentedLagrangian",
 }
-"""Name -> "module:class", in the order of tables and help texts. Of a name in FORMS it is the class of the default `on`."""
+"""Name -> "module:class", in the order of tables and help texts.
+
+A name in FORMS has several classes; this one is that of the default `on`.
+"""
 
 METHOD_ORDER = tuple(METHODS)
 
@@ -52,8 +55,10 @@ clean      g at the clean estimate x0, which is changed before the reverse step
 """
 
 FIXED = {"terminal": {"correction": "latent"}}
-"""Name -> settings that the name fixes. `terminal` is `projected` with the latent correction: only the trajectory that sampling
-ends at is asked to satisfy g, as in DiRecT (Giaretta et al., 2026).
+"""Name -> settings that the name fixes.
+
+`terminal` is `projected` with the latent correction: only the trajectory that sampling ends at has
+to satisfy g, as in DiRecT (Giaretta et al., 2026).
 """
 
 KERNELS = {
@@ -66,7 +71,7 @@ KERNELS = {
 
 
 def make_method(name: str, settings: Mapping[str, Any]) -> "Method":
-    """Build the method of that name with the settings; CdiffError where one does not exist or is out of range."""
+    """Build the named method; CdiffError where the name, a setting or its value is wrong."""
     values = complete_settings(name, settings) | FIXED.get(name, {})
     chosen = FORMS[name][values["on"]] if name in FORMS else METHODS[name]
     kind = _load(chosen)
@@ -74,9 +79,10 @@ def make_method(name: str, settings: Mapping[str, Any]) -> "Method":
 
 
 def complete_settings(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return every setting of the method of that name, checked: the given ones and the defaults of the others.
+    """Check the settings of the named method and add the defaults of all others.
 
-    Settings that one form of the method does not use are among them, so that records of all forms have the same fields.
+    Settings that the chosen form does not use are among them, so that the records of all forms of a
+    method have the same fields.
     """
     _require_known("method", name, METHODS)
     defaults, hints = _defaults(name)
@@ -96,7 +102,7 @@ def complete_settings(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_kernel(name: str) -> "Kernel":
-    """Return the reverse kernel of that name; CdiffError where there is none."""
+    """Return the named reverse kernel; CdiffError where there is none of that name."""
     _require_known("kernel", name, KERNELS)
     return _load(KERNELS[name])
 
@@ -115,7 +121,10 @@ def _load(path: str) -> Any:
 
 
 def _defaults(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Defaults and type hints of the settings that the name leaves open: `on`, then the fields of all its forms."""
+    """Defaults and type hints of the settings that the name leaves open.
+
+    They are `on` where the name has several forms, and the fields of all forms.
+    """
     forms: Iterable[str] = FORMS[name].values() if name in FORMS else [METHODS[name]]
     defaults: dict[str, Any] = {"on": DEFAULT_ON} if name in FORMS else {}
     hints: dict[str, Any] = {}

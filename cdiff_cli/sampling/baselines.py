@@ -1,4 +1,4 @@
-"""What the paper's methods are compared with, besides SafeDiffuser: each a few lines on the seams of methods.py."""
+"""Methods that the paper's three are compared with, besides SafeDiffuser (safediffuser.py)."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -29,9 +29,12 @@ class Unconstrained:
 
 @dataclass(frozen=True)
 class Guidance:
-    """x_{t-1} = reverse(x0) - weight sum dg(x_t): a push of constant weight along every row's gradient, violated or not.
+    """Guidance pushes with constant weight along the gradient of every row, violated or not.
 
-    The released maze code calls it conditional; the paper's text means `conditional`, trained.
+    x_{t-1} = reverse(x0) - weight sum_i dg_i(x_t)
+
+    The released maze code calls this "conditional". The paper's text means a trained planner: the
+    class Conditional.
 
     weight   5.5e-3 as released
     """
@@ -48,17 +51,19 @@ class Guidance:
 
     def step(self, step: Step, g: Constraint, state: None) -> tuple[Traj, None]:
         rows, pull, _ = g.linearise(step.x)
-        return step.reverse(step.x0) - self.weight * step.pins.free(
-            pull(torch.ones_like(rows))
-        ), None
+        push = step.pins.free(pull(torch.ones_like(rows)))
+        return step.reverse(step.x0) - self.weight * push, None
 
 
 @dataclass(frozen=True)
 class Conditional:
-    """The paper's Conditional: a planner trained with labels that say whether a window obeys the constraints, asked for one that
-    does (labels.py); its step is the plain one.
+    """The paper's Conditional uses a planner that is trained with constraint labels.
 
-    weight   of classifier-free guidance: 1 is the conditioned estimate itself, above it two network calls a step
+    The planner is conditioned on the label "satisfied" (training/labels.py). The step itself is the
+    unconstrained one.
+
+    weight   weight of classifier-free guidance; 1 is the conditioned estimate itself, other values
+             take two network calls per step
     """
 
     enforces: ClassVar[bool] = False
@@ -77,7 +82,7 @@ class Conditional:
 
 @dataclass(frozen=True)
 class FinalProjection:
-    """The unconstrained plan, projected once when it is done."""
+    """The unconstrained plan is projected once, after the last step."""
 
     enforces: ClassVar[bool] = True
     polished: ClassVar[bool] = True
@@ -94,9 +99,11 @@ class FinalProjection:
 
 @dataclass(frozen=True)
 class BestOf:
-    """k unconstrained plans a seed, of which open_loop.py keeps the safest: the least sum of [g]_+, the first among equals.
+    """Best of k samples k unconstrained plans per seed, and planning keeps one of them.
 
-    k   plans a seed; the network calls are k-fold
+    It is the plan with the least sum of [g]_+, the first among equals.
+
+    k   plans per seed; network calls are k-fold
     """
 
     enforces: ClassVar[bool] = True

@@ -1,11 +1,15 @@
-"""The paper's three methods on the clean estimate x0 instead of the noisy sample x_t: ours, see docs/paper.md, Deviations.
+"""The paper's three methods on the clean estimate x0 instead of the noisy sample x_t.
+
+They are ours, not the paper's: see docs/paper.md, Deviations.
 
 clean      the clean estimate is changed before the reverse step: x_{t-1} = reverse(x0')
-estimate   g is evaluated at the clean estimate, the sample is changed after the step: for control, dual methods alone
+estimate   g is evaluated at the clean estimate, and the sample is changed after the reverse step;
+           meant for control, dual methods only
 
-Where g keeps segments outside a ball, the dual methods use the rows of tangent half-spaces at x0 (projection/segments.py) in
-place of g's own. Their normals rotate evenly along the path, and each row keeps its place from step to step. The gradient of g
-itself pushes each segment straight away from the centre, and so tears the plan.
+Where g keeps segments outside a ball, the dual methods use the rows of tangent half-spaces at x0
+(projection/segments.py) in place of g's own. Their normals rotate evenly along the path, and each
+row keeps its place from step to step. The gradient of g itself pushes each segment straight away
+from the centre, and so tears the plan.
 """
 
 from dataclasses import dataclass
@@ -40,7 +44,8 @@ class CleanProjected:
 
     correction   how the projection reaches x_{t-1}.
                  kernel: x_{t-1} = reverse(x0'), weighed as the reverse step weighs a clean estimate
-                 latent: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (x0' - x0), whole, with the estimated noise kept
+                 latent: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (x0' - x0), whole, with the
+                 estimated noise kept
     """
 
     on: ClassVar[str] = "clean"

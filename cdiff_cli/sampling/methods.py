@@ -1,8 +1,9 @@
-"""The paper's three methods as printed: projected, primal-dual, augmented Lagrangian. Read beside its section 4.
+"""The paper's three methods as printed: projected, primal-dual, augmented Lagrangian.
 
-Notation: g(x) <= 0 is satisfied, lam are multipliers, and `reverse(x0)` is the unconstrained reverse step. With the kernel
-`langevin` that is the paper's x_t + (beta_t / 2) score + sqrt(beta_t) z (Eq. 8). Other kernels go on from the same clean estimate.
-The sample is changed after that step; pinned states do not move. clean_methods.py changes the clean estimate instead.
+Read beside the paper's section 4, in its order. `reverse(x0)` is the unconstrained reverse step:
+with the kernel `langevin` the paper's x_t + (beta_t / 2) score + sqrt(beta_t) z (Eq. 8). Other
+kernels go on from the same clean estimate. dg is the gradient of g. The sample is changed after the
+reverse step, and pinned states do not move. clean_methods.py changes the clean estimate instead.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,10 @@ from cdiff_cli.sampling.sampler import PlannerKind, Step
 
 @dataclass(frozen=True)
 class Projected:
-    """x_{t-1} = Pi_C(reverse(x0)): every sample is projected onto C = {g <= 0}   (paper, section 4.1)."""
+    """Projected diffusion projects every sample onto C = {g <= 0}   (paper, section 4.1).
+
+    x_{t-1} = Pi_C(reverse(x0))
+    """
 
     on: ClassVar[str] = "noisy"
     enforces: ClassVar[bool] = True
@@ -45,7 +49,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class PrimalDual:
-    """Primal-dual: multipliers lam rise with the violation, the sample descends lam^T g   (paper, section 4.2).
+    """Primal-dual: multipliers lam rise with the violation, x descends lam^T g   (section 4.2).
 
     x_{t-1} = reverse(x0) - c_t lam_t^T dg(x_t)     (Eq. pri)
     lam_{t-1} = [lam_t + eta E g(x_t)]_+            (Eq. dual)

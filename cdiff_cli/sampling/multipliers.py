@@ -1,4 +1,4 @@
-"""What the dual methods share: multipliers of the rows of g, one vector per plan or one for the batch."""
+"""Multipliers of the rows of g, and the formulas that all dual methods share."""
 
 from typing import Literal
 
@@ -11,7 +11,7 @@ from cdiff_cli.projection.segments import TangentPlanes, crossed, row_blocks, sp
 from cdiff_cli.sampling.sampler import Step
 
 Expectation = Literal["per_sample", "batch_mean"]
-"""E g: each plan's own rows and multipliers, or the batch mean and one set of multipliers (the paper's formula)."""
+"""E g: the rows and multipliers of each plan, or the batch mean and shared multipliers (paper)."""
 Positive = Literal["none", "silu"]
 """none: E g <= 0;  silu: E g / (1 + e^-g) <= 0, the smooth positive part of g (paper, Remark 1)."""
 Coefficient = Literal["beta/2", "one"]
@@ -31,9 +31,10 @@ def zeros(x: Traj, g: Constraint, expectation: Expectation, *, tangent_planes: b
 def linearise(
     g: Constraint | TangentPlanes, x: Traj, positive: Positive
 ) -> tuple[Rows, Pull, Rows]:
-    """Values g(x), their pull w -> w^T dg/dx, and row sizes |dg/dx|^2; of g, or of its smooth positive part g / (1 + e^-g).
+    """Values g(x), their pull w -> w^T dg/dx, and row sizes |dg/dx|^2.
 
-    The row sizes are those of g in both cases.
+    With `positive` silu the values and the pull are those of the smooth positive part
+    g / (1 + e^-g), and the row sizes stay those of g.
     """
     rows, pull, size = g.linearise(x)
     if positive == "none":
@@ -76,7 +77,9 @@ def multiplier(g: Rows, lam: Rows, rho: float) -> Rows:
 
 
 def idle(g: Constraint, step: Step, lam: Rows) -> bool:
-    """Whether a dual step on the clean estimate changes nothing: the estimate satisfies g and all multipliers are zero."""
+    """Whether a dual step on the clean estimate changes nothing: the estimate satisfies g and all
+    multipliers are zero.
+    """
     if _any_positive(lam):
         return False
     excluded, others = split_excluded(g)

@@ -1,4 +1,4 @@
-"""Noise that depends on a plan's own seed alone."""
+"""Noise that depends on the seed of a plan alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,8 +10,12 @@ from cdiff_cli.arrays import Traj
 
 @dataclass
 class Noise:
-    """Standard normal draws of one shape for a batch, one generator a seed, so that a seed's plan does not depend on its
-    neighbours in the batch and every method meets the same x_T and z.
+    """Standard normal draws for a batch, with one generator per seed.
+
+    The plan of a seed therefore does not depend on the other seeds of the batch, and every method
+    gets the same x_T and z.
+
+    shape   of one plan, (horizon, dim)
     """
 
     seeds: Sequence[int]
@@ -23,10 +27,8 @@ class Noise:
         self._generators = [torch.Generator().manual_seed(seed) for seed in self.seeds]
 
     def __call__(self) -> Traj:
-        """The next draw [batch, horizon, dim]."""
+        """Draw the next noise [batch, horizon, dim]."""
         draws = [torch.randn(self.shape, generator=generator) for generator in self._generators]
-        return (
-            torch.stack(draws).to(self.device)
-            if draws
-            else torch.empty(0, *self.shape, device=self.device)
-        )
+        if not draws:
+            return torch.empty(0, *self.shape, device=self.device)
+        return torch.stack(draws).to(self.device)

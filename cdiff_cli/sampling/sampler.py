@@ -1,4 +1,4 @@
-"""Diffusion: schedule, reverse kernels, training loss, and the only loop over the diffusion steps t."""
+"""Step and Method, and sample(): the only loop over the diffusion steps t."""
 
 import math
 from collections.abc import Callable
@@ -17,14 +17,16 @@ from cdiff_cli.sampling.kernels import Kernel, Previous, ddpm
 
 @dataclass(frozen=True)
 class Step:
-    """One reverse step as a method sees it: what is known, and the one way on.
+    """One reverse step as a method gets it.
 
-    x, x0     x_t and its clean estimate, pins painted, normalised   [batch, horizon, dim]
+    x, x0     x_t and its clean estimate, normalised, pinned states set   [batch, horizon, dim]
     beta      beta_t
     level     sqrt(alpha_bar_{t-1}), the share of the clean trajectory in x_{t-1}
-    reverse   clean estimate -> x_{t-1}; noise z and pins already bound; the next step's kernel knows the last estimate given
-    last      no noise follows: x_{t-1} is the plan, or a frozen step refines it
-    left      denoising steps still to come: 0 in the last and in the frozen ones
+    reverse   clean estimate -> x_{t-1}, with noise and pins bound; the kernel's next step gets the
+              last estimate passed to it
+    pins      fixed coordinates
+    last      whether no noise is added: x_{t-1} is the plan, or a frozen step refines it
+    left      remaining denoising steps; 0 in the last step and in the frozen ones
     """
 
     x: Traj
@@ -41,17 +43,23 @@ PlannerKind = Literal["unconditional", "conditional"]
 
 
 class Method(Protocol):
-    """A method acts on g <= 0 in every reverse step; it holds hyper-parameters only, its state is passed in and returned.
+    """A method acts on g <= 0 in every reverse step.
 
-    Attributes of the class, which say how a plan made with the method is treated:
+    It holds hyper-parameters only; its state is passed in and returned. Its attributes say how
+    plans are treated:
 
-    enforces     The sampled plans depend on g, so margins that tighten g change them. False for `diffuser` and `conditional`.
-    polished     The final projection applies to the plans, and a warm plan that violates g is made anew from noise.
-                 False for `diffuser` and `best-of-k`, whose plans stay as the network made them.
-    candidates   Plans sampled per seed, of which the one with the least sum of [g]_+ is kept: k of `best-of-k`, else 1.
-    planner      The checkpoint that it samples from: the task's, or the one trained with constraint labels.
+    enforces     The sampled plans depend on g, so margins that tighten g change them. False for
+                 `diffuser` and `conditional`.
+    polished     The final projection applies to the plans, and a warm plan that violates g is made
+                 anew from noise. False for `diffuser` and `best-of-k`, whose plans stay as the
+                 network made them.
+    candidates   Plans sampled per seed, of which the one with the least sum of [g]_+ is kept: k of
+                 `best-of-k`, else 1.
+    planner      The checkpoint that it samples from: the task's, or the one trained with constraint
+                 labels.
 
-    Only `diffuser` is neither enforcing nor polished: its plans are the unconstrained plans that others are compared with.
+    Only `diffuser` is neither enforcing nor polished: its plans are the unconstrained plans that
+    others are compared with.
     """
 
     @property
@@ -87,12 +95,15 @@ def sample(
     state: Any = None,
     on_step: Callable[[int, Step, Traj], None] | None = None,
 ) -> Sample:
-    """Draw plans x_0: the only loop over the diffusion steps.
+    """Sample plans x_0 from noise, with the method acting in every reverse step.
 
-    first        x_T, the schedule's noisiest; drawn where None
-    extra_steps  further steps with t frozen at 1 and no noise, the multipliers still moving (the released code's)
-    state        the method's state before its first step; method.init() where None
-    on_step      called with the number of network calls so far, the step and x_{t-1}
+    denoiser      (x_t, t) -> clean estimate, normalised
+    noise         draws standard normal noise [batch, horizon, dim]
+    extra_steps   further steps with t frozen at 1 and no noise, in which the multipliers still
+                  move; as in the released code
+    first         x_T; None: drawn
+    state         the method's state before its first step; None: method.init()
+    on_step       called with the number of network calls so far, the step and x_{t-1}
     """
     x = pins.paint(noise() if first is None else first)
     state = method.init(x, g) if state is None else state
@@ -102,11 +113,11 @@ def sample(
         last = i == 1
         z = torch.zeros_like(x) if last else noise()
         a, b = schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
-        here = x
+        x_t = x
 
         def reverse(
             clean: Traj,
-            x: Traj = here,
+            x: Traj = x_t,
             z: Traj = z,
             a: float = a,
             b: float = b,
@@ -116,7 +127,7 @@ def sample(
             used = clean, a
             return pins.paint(kernel(x, clean, z, a, b, previous))
 
-        step = Step(here, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last, i - 1)
+        step = Step(x_t, x0, schedule.beta(i), math.sqrt(b), reverse, pins, last, i - 1)
         x, state = method.step(step, g, state)
         if on_step:
             on_step(call, step, x)

@@ -1,9 +1,12 @@
-"""The environments: a literal table from name to module."""
+"""The shipped tasks: a literal table from name to module."""
 
 import importlib
+from typing import TYPE_CHECKING
 
 from cdiff_cli.errors import CdiffError, suggestion
-from cdiff_cli.tasks.protocol import Task
+
+if TYPE_CHECKING:
+    from cdiff_cli.tasks.protocol import Task
 
 TASKS = {
     "maze2d-umaze": "cdiff_cli.tasks.maze2d:UMAZE",
@@ -15,8 +18,8 @@ TASKS = {
 }
 
 
-def load_task(name: str) -> Task:
-    """The task of that name; a CdiffError with a suggestion where there is none."""
+def load_task(name: str) -> "Task":
+    """The task of that name; CdiffError with a suggestion if there is none."""
     if name not in TASKS:
         raise CdiffError(
             f'no task "{name}"{suggestion(name, TASKS)}; choose from {", ".join(TASKS)}'

@@ -43,7 +43,7 @@ class Task(Protocol):
     def name(self) -> str: ...
     @property
     def layout(self) -> tuple[str, ...]:
-        """Names of the coordinates of a state, in order; YAML and reports use names, not indices."""
+        """Names of the coordinates of a state, in order; YAML and reports use the names."""
         ...
 
     @property

@@ -175,7 +175,7 @@ def _minimise(
     save_every: int,
     on_step: OnStep | None,
 ) -> None:
-    """Optimiser steps up to the end of the recipe; the state is saved on the way and at an error."""
+    """Optimiser steps to the end of the recipe; the state is saved regularly and at an error."""
     pinned = training_set.pinned.to(state.device)
     steps = state.spec.steps
     start = time.monotonic() - state.wall_s

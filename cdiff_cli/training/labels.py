@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from cdiff_cli.arrays import Traj
-from cdiff_cli.constraints.observed import Observed, ObservedValues
+from cdiff_cli.constraints.observed import ObservedValues
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.tasks.protocol import Task, observable_of
@@ -35,8 +35,7 @@ class ConstraintLabel:
         """The constraints of a file; raises SpecError."""
         observable = observable_of(task)
         kinds, g = load_constraints(path, task.name, task.layout, None, observable, task.dt)
-        used = {name for part in g.parts if isinstance(part, Observed) for name in part.names}
-        observed = tuple(name for name in observable if name in used)
+        observed = tuple(name for name in observable if name in g.observes)
         return cls(path.stem, g, kinds_sha256(kinds), observed)
 
     @property
@@ -57,6 +56,6 @@ class ConstraintLabel:
 
 
 def drop(label: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Labels of which that share, drawn at random, is replaced by zeros, which mean no condition."""
+    """Labels, a random share of them replaced by zeros, which mean no condition."""
     keep = torch.rand(len(label), 1, generator=generator) >= share
     return label * keep

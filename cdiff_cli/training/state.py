@@ -1,4 +1,4 @@
-"""The state of a training: one optimiser step, and saving it so that a resumed run gets equal bits."""
+"""The state of a training: one optimiser step, and saving for a resumed run with equal bits."""
 
 import math
 from dataclasses import dataclass

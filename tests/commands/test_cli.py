@@ -1,6 +1,7 @@
 """The command line as typed: exit codes, content, what is on disk afterwards."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -43,14 +44,14 @@ def test_plan_with_alm_prints_its_table_and_picture(alm_run):
         "n = 2",
         "distance / m",
         "worst segment / g",
-        "network calls a plan",
+        "network calls per plan",
         "plan.png",
     ):
         assert word in stdout
     assert str(run) in stdout
 
 
-def test_a_run_holds_every_artifact_of_the_interface(alm_run):
+def test_run_directory_of_a_plan_holds_every_file(alm_run):
     run, _ = alm_run
     names = {
         "run.yaml",
@@ -67,7 +68,7 @@ def test_a_run_holds_every_artifact_of_the_interface(alm_run):
         assert plan["x"].dtype == np.float64
         assert list(plan["layout"]) == ["x", "y", "vx", "vy"]
     config = yaml.safe_load((run / "run.yaml").read_text())
-    assert config["method"]["alm"]["on"] == "clean"
+    assert config["preset"]["methods"]["alm"]["on"] == "clean"
     assert len(config["checkpoint"]["weights_sha256"]) == 64
 
 
@@ -78,7 +79,7 @@ def test_recommended_alm_has_zero_violation_at_waypoints_in_float64(alm_run):
         assert (plan["x"][..., 0] - plan["x"][..., 1]).max() <= 1.82
 
 
-def test_a_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
+def test_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
     run, stdout = alm_run
     proof = json.loads((run / "certificate.json").read_text())
     assert [entry["status"] for entry in proof["entries"]] == ["safe", "safe"]
@@ -91,7 +92,7 @@ def test_a_half_space_safe_at_waypoints_is_safe_on_segments(alm_run):
     assert "certificate  2 of 2 plans safe at the waypoints, 2 of 2 between them\n" in stdout
 
 
-def test_plans_begin_and_end_where_asked(alm_run):
+def test_plans_begin_at_the_start_and_end_at_the_goal(alm_run):
     run, _ = alm_run
     recipe = load_recipe("maze2d-umaze")
     with np.load(run / "plan.npz") as plan:
@@ -103,9 +104,7 @@ def test_plans_begin_and_end_where_asked(alm_run):
         )  # what the dynamics make
 
 
-def test_without_dynamics_no_inputs_are_planned_and_the_preset_is_marked_as_changed(
-    alm_run, tmp_path
-):
+def test_no_dynamics_plans_no_inputs_and_marks_the_preset_as_changed(alm_run, tmp_path):
     with np.load(alm_run[0] / "plan.npz") as plan:
         assert plan["u"].shape == (2, 127, 2)
     cdiff("plan", "--method", "alm", "--n", 1, "--no-dynamics", "--runs", tmp_path)
@@ -150,7 +149,7 @@ def test_every_method_and_preset_plans(method, preset, tmp_path):
     assert json.loads(result.stdout)["summary"][0]["violation"]["mean"] < 20
 
 
-def test_extra_steps_can_be_asked_for_and_mark_the_preset_as_changed(tmp_path):
+def test_extra_steps_option_adds_calls_and_marks_the_preset_as_changed(tmp_path):
     words = (
         "--method",
         "safediffuser",
@@ -170,15 +169,13 @@ def test_extra_steps_can_be_asked_for_and_mark_the_preset_as_changed(tmp_path):
 
 def test_each_method_of_the_released_preset_takes_its_own_extra_steps():
     preset = load_recipe("maze2d-umaze").presets["released"]
-    assert [preset.extra_steps_for(name) for name in ("alm", "safediffuser", "diffuser")] == [
-        100,
-        50,
-        0,
-    ]
+    methods = ("alm", "safediffuser", "diffuser")
+    taken = [preset.of_method(name).sampler.extra_steps for name in methods]
+    assert taken == [100, 50, 0]
 
 
 @pytest.mark.parametrize("kernel", ["ddim", "dpm++2m"])
-def test_few_steps_make_few_calls_and_still_obey(kernel, tmp_path):
+def test_few_steps_make_few_calls_and_satisfy_the_constraints(kernel, tmp_path):
     result = cdiff("plan", "--kernel", kernel, "--steps", 8, "--n", 1, "--json", "--runs", tmp_path)
     summary = json.loads(result.stdout)["summary"][0]
     assert summary["calls"]["mean"] == 8
@@ -186,7 +183,7 @@ def test_few_steps_make_few_calls_and_still_obey(kernel, tmp_path):
     assert summary["preset"] == "recommended*"
 
 
-def test_a_barrier_and_two_constraints_at_once_are_obeyed(tmp_path):
+def test_barrier_and_two_constraints_at_once_are_satisfied(tmp_path):
     for name in ("pillar", "speed"):
         file = ROOT / "constraints" / f"maze2d-umaze-{name}.yaml"
         result = cdiff(
@@ -255,7 +252,7 @@ def test_verify_certifies_a_run_of_alm(alm_run):
     )
 
 
-def test_verify_refuses_what_ignores_a_constraint_that_binds(tmp_path):
+def test_verify_does_not_certify_plans_that_ignore_an_active_constraint(tmp_path):
     slalom = ROOT / "constraints" / "maze2d-umaze-slalom.yaml"
     cdiff("plan", "--method", "diffuser", "--constraints", slalom, "--n", 4, "--runs", tmp_path)
     assert "NOT certified" in cdiff("verify", tmp_path, code=1).stdout
@@ -271,7 +268,7 @@ def test_verify_certifies_a_disc_and_a_barrier(name, tmp_path):
     )
 
 
-def test_compare_groups_runs_and_shows_the_paper(alm_run):
+def test_compare_prints_groups_and_the_papers_values(alm_run):
     run, _ = alm_run
     stdout = cdiff("compare", run.parent).stdout
     assert "alm" in stdout
@@ -281,7 +278,7 @@ def test_compare_groups_runs_and_shows_the_paper(alm_run):
     assert cdiff("compare", run.parent, "--format", "latex").stdout.startswith(r"\begin{tabular}")
 
 
-def test_check_explains_and_draws(tmp_path):
+def test_check_prints_the_meaning_and_draws_a_picture(tmp_path):
     picture = tmp_path / "c.png"
     result = cdiff("check", ROOT / "constraints" / "maze2d-large.yaml", "--picture", picture)
     for word in ("disc", "quadratic", "outside the ball", "384", "exact"):
@@ -294,7 +291,8 @@ def test_check_exports_a_json_schema():
     assert {"Linear", "Quadratic", "Dcbf"} <= set(schema["$defs"])
 
 
-GOOD = "task: maze2d-umaze\nconstraints:\n  - {name: cut, kind: linear, a: {x: 1.0, y: -1.0}, b: 1.82}\n"
+HEAD = "task: maze2d-umaze\nconstraints:\n"
+GOOD = HEAD + "  - {name: cut, kind: linear, a: {x: 1.0, y: -1.0}, b: 1.82}\n"
 BAD = {
     "unknown coordinate": (
         GOOD.replace("y: -1.0", "yy: -1.0"),
@@ -316,12 +314,12 @@ BAD = {
         "relax",
     ),
     "negative radius": (
-        "task: maze2d-umaze\nconstraints:\n  - {kind: quadratic, side: outside, centre: {x: 1, y: 0}, radius: -1}\n",
+        HEAD + "  - {kind: quadratic, side: outside, centre: {x: 1, y: 0}, radius: -1}\n",
         ":3 constraints[0].radius",
         "greater than 0",
     ),
     "alpha": (
-        "task: maze2d-umaze\nconstraints:\n  - {kind: dcbf, alpha: 1.5, barrier: {kind: linear, a: {vx: 1}, b: 4}}\n",
+        HEAD + "  - {kind: dcbf, alpha: 1.5, barrier: {kind: linear, a: {vx: 1}, b: 4}}\n",
         ":3 constraints[0].alpha",
         "less than or equal to 1",
     ),
@@ -330,7 +328,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_constraint_file_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
+def test_bad_constraint_file_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
     text, *expected = BAD[case]
     file = tmp_path / "bad.yaml"
     file.write_text(text)
@@ -379,12 +377,12 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("case", OPTIONS)
-def test_a_bad_option_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
+def test_bad_option_gets_one_line_exit_2_and_writes_nothing(case, tmp_path):
     words, expected = OPTIONS[case]
     refused("plan", *words, expected=expected, tmp_path=tmp_path)
 
 
-def test_a_checkpoint_of_another_task_is_refused(tmp_path):
+def test_checkpoint_of_another_task_is_refused(tmp_path):
     other = home() / "models" / "maze2d-large" / "small.safetensors"
     refused(
         "plan",
@@ -395,7 +393,7 @@ def test_a_checkpoint_of_another_task_is_refused(tmp_path):
     )
 
 
-def test_a_truncated_checkpoint_is_refused(tmp_path):
+def test_truncated_checkpoint_is_refused(tmp_path):
     source = home() / "models" / "maze2d-umaze"
     broken = tmp_path / "broken.safetensors"
     broken.write_bytes((source / "small.safetensors").read_bytes()[:100_000])
@@ -433,22 +431,95 @@ def test_help_names_every_method():
     assert ", ".join(METHOD_ORDER) in shown
 
 
-def test_help_names_every_task_and_what_is_taken_where_nothing_is_said():
+def test_help_names_every_task_and_the_defaults_that_are_not_literal():
     shown = " ".join(cdiff("rollout", "--help").stdout.replace("│", " ").split())
     assert ", ".join(TASKS) in shown
     assert "YAML file of constraints [default: the task's own]" in shown
 
 
+COMMANDS = {*("plan", "rollout", "verify", "compare", "sweep", "rerun", "check", "list", "train")}
+WITHOUT_TORCH = """
+import sys
+from typer.testing import CliRunner
+from cdiff_cli.cli import app
+result = CliRunner().invoke(app, sys.argv[2:])
+assert result.exit_code == int(sys.argv[1]), result.output + result.stderr
+assert "torch" not in sys.modules
+print(result.output)
+"""
+
+
+def without_torch(*words, code=0):
+    """What a new process prints, which must not have imported torch."""
+    program = [sys.executable, "-c", WITHOUT_TORCH, str(code), *map(str, words)]
+    run = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return run.stdout
+
+
 def test_help_names_every_command_and_imports_no_torch():
-    program = (
-        "import sys; from typer.testing import CliRunner; from cdiff_cli.cli import app; "
-        "print(CliRunner().invoke(app, ['--help']).output); assert 'torch' not in sys.modules"
+    shown = without_torch("--help")
+    assert [name for name in COMMANDS if f"│ {name} " not in shown] == []
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_of_each_command_has_an_example_with_options_that_exist(command):
+    shown = cdiff(command, "-h").stdout
+    assert shown == cdiff(command, "--help").stdout
+    (example,) = [line.strip() for line in shown.splitlines() if "Example: cdiff" in line]
+    cdiff(*example.removeprefix("Example: cdiff ").split(), "--help")
+
+
+def test_options_stand_in_panels():
+    shown = cdiff("rollout", "-h").stdout
+    panels = [line.split("─ ")[1].split(" ─")[0] for line in shown.splitlines() if "╭─" in line]
+    assert panels == ["Options", "Task", "Constraint", "Sampling", "Execution", "Output"]
+
+
+def test_version_is_that_of_the_package():
+    import cdiff_cli
+
+    assert cdiff("--version").stdout == f"cdiff {cdiff_cli.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("cdiff plan --method pri", ["primal-dual"]),
+        ("cdiff plan --task maze", ["maze2d-umaze", "maze2d-large"]),
+        ("cdiff list m", ["methods", "models"]),
+        ("cdiff re", ["rerun"]),
+    ],
+)
+def test_shell_completes_commands_and_names(line, expected):
+    words = line.split()
+    variables = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    completed = subprocess.run(
+        [sys.executable, "-c", "from cdiff_cli.cli import app; app(prog_name='cdiff')"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | variables | {"_CDIFF_COMPLETE": "complete_bash"},
     )
-    shown = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    for command in ("train", "plan", "rollout", "verify", "compare", "check"):
-        assert command in shown
+    assert completed.stdout.split() == expected
+
+
+MISSPELT = {
+    "task": (["plan", "--task", "maze2d-umase"], 'no task "maze2d-umase" (did you mean'),
+    "method": (["plan", "--method", "almm"], 'no method "almm" (did you mean "alm"?)'),
+    "preset": (["rollout", "--preset", "papr"], 'no preset "papr" (did you mean "paper"?)'),
+    "kernel": (["rollout", "--kernel", "dim"], 'no kernel "dim" (did you mean "ddim"?)'),
+    "format": (["compare", "--format", "cvs"], 'no format "cvs" (did you mean "csv"?)'),
+    "sweep": (["sweep", "--methods", "alm,almm"], '--methods: no method "almm"'),
+    "train": (["train", "--recipe", "smal"], 'no recipe "smal" (did you mean "small"?)'),
+    "list": (["list", "taks"], 'no list "taks" (did you mean "tasks"?)'),
+}
+
+
+@pytest.mark.parametrize("name", MISSPELT)
+def test_misspelt_name_is_refused_before_torch_is_imported(name):
+    words, message = MISSPELT[name]
+    assert message in without_torch(*words, code=2)
 
 
 @pytest.mark.parametrize("task", ["maze2d-umaze", "maze2d-large", "gaussian2d"])

@@ -1,114 +1,90 @@
-"""Derived columns, intervals and paired differences of a comparison, and the command that prints them."""
+"""`cdiff compare`: its columns, its formats, its widths, its refusals."""
 
+import csv
+import io
 import json
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from cdiff_cli.commands.run_directory import write_rows
-from cdiff_cli.evaluation.columns import COLUMNS
-from cdiff_cli.evaluation.comparison import Cell, compare, differences
-from cdiff_cli.evaluation.statistics import clopper_pearson
-from cdiff_cli.evaluation.tables import FORMATS, header_and_lines, notes, render_differences
 from tests.commands.test_cli import cdiff
-from tests.commands.test_run_directory import row
-
-
-def rows(method="alm", base=0.0, n=6, **more):
-    return [row(seed, method, distance=base + seed**2, **more) for seed in range(n)]
-
-
-def test_torn_is_one_minus_smooth():
-    (group,) = compare([row(0, smooth=1.0), row(1, smooth=0.0), row(2, smooth=0.0)])
-    assert group.cells["torn"].mean == pytest.approx(2 / 3)
-
-
-def test_shares_are_known_by_their_meaning():
-    assert {name for name, column in COLUMNS.items() if column.share} >= {
-        "torn",
-        "smooth",
-        "success",
-        "safe_executed",
-        "wall",
-    }
-    assert not COLUMNS["violation_rate"].share  # percent of the states of one episode
-
-
-def test_intervals_stand_beside_the_mean_and_not_at_costs():
-    (group,) = compare(
-        [row(i, success=float(i > 1), calls=64.0, distance=float(i)) for i in range(10)],
-        intervals=True,
-    )
-    assert group.cells["success"].interval == clopper_pearson(8, 10)
-    assert group.cells["success"].text(2) == "0.80 ± 0.13 [0.44, 0.97]"
-    assert group.cells["calls"].text(0) == "64"
-    assert Cell(1.0, 0.0, 5, (0.48, 1.0)).text(2) == "1.00 [0.48, 1.00]"
-
-
-def test_a_cell_of_fewer_values_than_rows_says_so():
-    groups = compare([row(0, distance=1.0, jump=2.0), row(1, distance=3.0), row(2, distance=3.0)])
-    _, lines = header_and_lines(groups, ("distance", "jump"), None)
-    assert lines[0][-1] == "2.0000 (n = 1)"
-
-
-def test_differences_are_paired_by_seed_within_task_constraints_and_preset():
-    mine, theirs = rows("projected", 1.0), rows("alm", 0.0)[:5]
-    other = [row(seed, "projected", "paper", "maze2d-large", distance=99.0) for seed in range(6)]
-    (found,) = differences([*mine, *theirs, *other], "alm", ["distance"])
-    assert found.key == ("maze2d-umaze", "corner", "projected", "paper")
-    assert (found.n, found.mean, found.interval) == (5, 1.0, (1.0, 1.0))
-    assert found.p == found.holm == pytest.approx(2 / 2**5)
-
-
-def test_holm_corrects_all_tests_of_one_metric():
-    many = [
-        r
-        for i, name in enumerate(("diffuser", "projected", "primal-dual"))
-        for r in rows(name, 1.0 + i)
-    ]
-    found = differences([*many, *rows("alm")], "alm", ["distance", "calls"])
-    assert [each.holm for each in found] == pytest.approx([3 * 2 / 2**6] * 3)
-
-
-def test_a_metric_that_nowhere_differs_is_left_out():
-    assert (
-        differences(
-            [*rows("projected", steps=5.0), *rows("alm", 1.0, steps=5.0)],
-            "alm",
-            ["steps", "distance"],
-        )[0].metric
-        == "distance"
-    )
-
-
-@pytest.mark.parametrize("style", FORMATS)
-def test_every_format_holds_the_differences(style):
-    found = differences([*rows("projected", 1.0), *rows("alm")], "alm", ["distance"])
-    table = render_differences(found, style, "plans against alm")
-    if style != "rich":
-        assert "projected" in table
-        assert ("0.03125" if style == "json" else "0.031") in table
-
-
-def test_notes_name_what_is_shown_alone():
-    groups = compare([row(0, "guidance", "released*", violation_paper=1.0)])
-    said = " ".join(notes(groups, ("violation_paper", "step_ms")))
-    assert "guidance: what the released maze code calls Conditional" in said
-    assert "violation (paper)" in said
-    assert "released: frozen steps" in said
-    assert "step / ms" not in said
+from tests.evaluation.test_comparison import rows
 
 
 @pytest.fixture
 def folder(tmp_path):
     for name, methods in (("a", ("alm",)), ("b", ("projected", "diffuser"))):
         (tmp_path / name).mkdir()
-        made = [
-            r
-            for i, m in enumerate(methods)
-            for r in rows(m, 1.0 + i, smooth=1.0, violation_paper=0.5)
+        content = [
+            line
+            for i, method in enumerate(methods)
+            for line in rows(method, 1.0 + i, smooth=1.0, violation_paper=0.5, jump=0.125)
         ]
-        write_rows(tmp_path / name / "rows.csv", made)
+        write_rows(tmp_path / name / "rows.csv", content)
     return tmp_path
+
+
+@pytest.fixture
+def three_kinds(tmp_path):
+    """A folder with runs of all kinds: plans, a rollout of plans, a closed loop."""
+    for kind, more in (
+        ("plan", {"violation": 0.5}),
+        ("rollout", {"violation_rate": 1.0, "safe_executed": 0.0}),
+        ("control", {"violation_rate": 2.0, "plan_violation": 0.25, "reward": 9.0}),
+    ):
+        (tmp_path / kind).mkdir()
+        write_rows(tmp_path / kind / "rows.csv", rows(kind, **more))
+    return tmp_path
+
+
+def headings(shown):
+    """The columns of the first table of a markdown output, keys and n left out."""
+    return [cell.strip() for cell in shown.splitlines()[0].strip("| ").split("|")][5:]
+
+
+def test_few_columns_are_shown_unless_wide_or_named(folder):
+    words = ("compare", folder, "--format", "markdown")
+    assert headings(cdiff(*words).stdout) == ["torn", "distance / m"]
+    wide = headings(cdiff(*words, "--wide").stdout)
+    assert wide == ["distance / m", "torn", "jump / m"]
+    assert headings(cdiff(*words, "--columns", "jump, torn").stdout) == ["jump / m", "torn"]
+
+
+def test_json_and_csv_hold_every_column(folder):
+    record = json.loads(cdiff("compare", folder, "--format", "json").stdout)["plans"][0]
+    assert {"distance", "torn", "jump"} <= set(record)
+    lines = list(csv.DictReader(io.StringIO(cdiff("compare", folder, "--format", "csv").stdout)))
+    assert {line["metric"] for line in lines} == {"distance", "torn", "jump"}
+
+
+def test_csv_of_all_kinds_of_runs_has_one_header(three_kinds):
+    text = cdiff("compare", three_kinds, "--format", "csv").stdout
+    lines = list(csv.DictReader(io.StringIO(text)))
+    assert {line["kind"] for line in lines} == {"plans", "rollouts", "closed loop"}
+    assert text.count("kind,task,constraints") == 1
+    for line in lines:
+        float(line["mean"]), int(line["n"]), float(line["standard_error"])
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize(
+    "more", [(), ("--wide",), ("--paper",), ("--against", "alm"), ("--intervals",)]
+)
+def test_no_heading_is_wrapped_and_no_line_too_long(width, more, tmp_path, monkeypatch):
+    """On the shipped rows of the U-maze: ten methods, three presets."""
+    shipped = Path(__file__).parents[2] / "runs" / "reference" / "table1-umaze"
+    (tmp_path / "run").symlink_to(shipped)
+    screen = io.StringIO()
+    monkeypatch.setattr("cdiff_cli.cli.out", Console(file=screen, width=width))
+    cdiff("compare", tmp_path, *more)
+    printed = screen.getvalue().splitlines()
+    assert max(map(len, printed)) <= width
+    rules = [i for i, line in enumerate(printed) if line and set(line) == {"─"}]
+    assert rules
+    for i in rules:
+        assert printed[i - 1].startswith(("method", "preset"))
 
 
 def test_compare_against_a_method_prints_its_tests(folder):
@@ -141,9 +117,13 @@ def test_compare_with_the_paper_has_its_notes(folder):
         (["--against", "almm"], '--against: no runs of "almm"'),
         (["--against", "alm", "--test", "u"], "--test: expected wilcoxon or t, found u"),
         (["--format", "xml"], 'no format "xml"'),
+        (["--columns", "jumps"], '--columns: no column "jumps" (did you mean "jump"?)'),
+        (["--columns", ","], "--columns: expected names such as violation,torn, found none"),
+        (["--columns", "reward"], "--columns: no run here has reward"),
+        (["--columns", "jump", "--wide"], "--columns and --wide: choose one of them"),
     ],
 )
-def test_a_bad_option_of_compare_is_one_clear_line(words, message, folder):
+def test_bad_option_of_compare_is_refused_in_one_line(words, message, folder):
     stderr = cdiff("compare", folder, *words, code=2).stderr
     assert message in stderr
     assert len(stderr.strip().splitlines()) == 1

@@ -25,7 +25,7 @@ from cdiff_cli.models.checkpoint import (
 from cdiff_cli.models.denoiser import calls_a_step
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
-from cdiff_cli.planning import receding_horizon
+from cdiff_cli.planning.receding_horizon import rollout as act
 
 ROOT = Path(__file__).parents[2]
 BALL = ("rollout", "--task", "ball-run")
@@ -108,7 +108,7 @@ def test_a_closed_loop_run_holds_every_artifact(ball_run):
         "rollout.gif",
     }
     with np.load(run / "rollout.npz", allow_pickle=False) as done:
-        assert done["x"].shape == done["planned"].shape == (2, 101, 4)
+        assert done["x"].shape == done["predicted"].shape == (2, 101, 4)
         assert done["u"].shape == (2, 100, 2)
         assert done["reward"].shape == (2, 100)
         assert list(done["layout"]) == ["x", "y", "vx", "vy"]
@@ -125,7 +125,7 @@ def test_a_closed_loop_run_holds_every_artifact(ball_run):
         ("ball-run", "alm", "recommended", "ball-run")
     }
     config = yaml.safe_load((run / "run.yaml").read_text())
-    assert config["execute"] == 1
+    assert config["preset"]["control"]["execute"] == 1
     assert config["command"][0] == "cdiff"
     assert len(config["checkpoint"]["weights_sha256"]) == 64
 
@@ -188,7 +188,7 @@ def test_options_of_the_environment_are_part_of_what_was_asked(tmp_path):
 @pytest.mark.parametrize("method", ["guidance", "terminal", "final-projection", "best-of-k"])
 def test_the_baselines_act_too(task, method, tmp_path, monkeypatch):
     """Four steps: that each acts, and makes the network calls it says."""
-    monkeypatch.setattr(rollout, "control", partial(receding_horizon.control, steps=4))
+    monkeypatch.setattr(rollout, "rollout", partial(act, steps=4))
     words = (
         "--method",
         method,
@@ -216,11 +216,8 @@ def test_calibration_writes_margins_beside_the_checkpoint_and_rollouts_use_them(
     assert "margins at level 0.75 from 3 episodes, pass " in stdout
     (found,) = read_calibrations(checkpoint)
     assert (found.stem, found.level, found.episodes, found.seed) == ("ball-run", 0.75, 3, 0)
-    assert (
-        found.conditions.method,
-        found.conditions.execute,
-        found.conditions.settings["rho"],
-    ) == ("alm", 8, 10.0)
+    assert (found.method, found.preset.control.execute) == ("alm", 8)
+    assert found.preset.methods["alm"]["rho"] == 10.0
     margin = found.margins["moving-ball"]
     assert margin.margin >= max(
         margin.largest, 0.0
@@ -231,10 +228,9 @@ def test_calibration_writes_margins_beside_the_checkpoint_and_rollouts_use_them(
     (run,) = (tmp_path / "runs").iterdir()
     config = yaml.safe_load((run / "run.yaml").read_text())
     assert config["margins"] == {"moving-ball": margin.margin}
-    assert (
-        config["margins_from"]["match"],
-        config["margins_from"]["calibrated"]["conditions"]["execute"],
-    ) == ("exact", 8)
+    source = config["margins_from"]
+    assert source["match"] == "exact"
+    assert source["calibrated"]["preset"]["control"]["execute"] == 8
 
 
 def test_a_rollout_says_where_its_margins_were_calibrated_on_something_else(tmp_path):

@@ -1,4 +1,4 @@
-"""Which calibrated margins a rollout uses, what is said where none fits, and the file beside the checkpoint."""
+"""Which calibrated margins a rollout uses, its note where none fits, and the margins file."""
 
 import pytest
 import yaml
@@ -24,7 +24,7 @@ NOW = Preset(
 
 
 def now(method="alm", **changes):
-    """NOW with other values, "__" for the dot in a dotted name; of another method with the same constants."""
+    """NOW with other values, "__" for the dot of a name; methods share their constants."""
     dotted = {name.replace("__", "."): value for name, value in changes.items()}
     return NOW.updated({"methods": {method: NOW.methods["alm"]}} | dotted)
 
@@ -105,7 +105,7 @@ def test_note_says_both_values():
     )
 
 
-def test_where_none_matches_the_same_method_goes_before_the_same_execution_and_the_latest_before_older_ones():
+def test_where_none_matches_the_method_goes_before_the_rest_and_the_latest_before_older_ones():
     other_method, longer = (
         made(0.1, now("projected", control__execute=4)),
         made(0.2, now(control__execute=2, control__warm_start=0.3)),
@@ -154,7 +154,8 @@ def test_margins_belong_to_their_weights_and_follow_the_constraints_to_a_file_of
 def test_without_margins_the_user_is_told_how_to_get_them():
     note = choose([]).note(NOW, "easy.yaml", "cdiff rollout --calibrate")
     assert note == (
-        "note: no margin was calibrated on easy.yaml, plans go up to the limit itself; fit margins with `cdiff rollout --calibrate`"
+        "note: no margin was calibrated on easy.yaml, plans go up to the limit itself; "
+        "fit margins with `cdiff rollout --calibrate`"
     )
     assert choose([made(0.1)]).note(NOW, "easy.yaml", "") == ""
 

@@ -1,4 +1,4 @@
-"""A sweep: its matrix, what it leaves and skips, what it says of failures, and that a killed one ends as an uninterrupted one."""
+"""`cdiff sweep`: its matrix, the runs it makes and skips, failures, interruptions."""
 
 import signal
 import subprocess
@@ -17,7 +17,7 @@ from cdiff_cli.commands.sweep import Matrix, Outcome, plan_sweep, progress_table
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.evaluation.columns import COSTS
 from cdiff_cli.evaluation.comparison import newest
-from cdiff_cli.planning import receding_horizon
+from cdiff_cli.planning.receding_horizon import rollout as act
 from tests.commands.test_cli import cdiff
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,10 @@ def matrix(methods=("projected",), seeds=(0, 1), **more):
 
 
 def table(root):
-    """What `compare` averages, times apart: the newest row of a seed, for a worker may end its run after its sweep was killed."""
+    """What `compare` averages, without times: the newest row per seed.
+
+    A worker may end its run after its sweep was killed, and leave a second row of a seed.
+    """
     plans, _ = merge_kinds(root)
     rows = [row for by_seed in newest(plans).values() for _, row in sorted(by_seed.items())]
     return [{name: value for name, value in row.items() if name not in COSTS} for row in rows]
@@ -53,7 +56,7 @@ def whole(tmp_path_factory):
     return root
 
 
-def test_a_sweep_makes_one_run_a_seed_and_a_second_one_nothing(whole):
+def test_sweep_makes_one_run_per_seed_and_a_second_sweep_none(whole):
     assert len(table(whole)) == 6
     before = sorted(whole.iterdir())
     result = cdiff(*GAUSSIAN, "--runs", whole)
@@ -61,9 +64,7 @@ def test_a_sweep_makes_one_run_a_seed_and_a_second_one_nothing(whole):
     assert sorted(whole.iterdir()) == before
 
 
-def test_a_sweep_of_two_jobs_killed_half_way_and_resumed_ends_as_an_uninterrupted_one(
-    whole, tmp_path
-):
+def test_killed_and_continued_sweep_ends_as_an_uninterrupted_one(whole, tmp_path):
     program = [
         sys.executable,
         "-c",
@@ -84,7 +85,7 @@ def test_a_sweep_of_two_jobs_killed_half_way_and_resumed_ends_as_an_uninterrupte
     assert table(tmp_path) == table(whole)
 
 
-def test_edited_constants_are_other_runs(whole, monkeypatch):
+def test_changed_constants_of_a_method_make_other_runs(whole, monkeypatch):
     assert len(plan_sweep(matrix(), whole).done) == 2
     load = resolve.resolve
 
@@ -97,7 +98,7 @@ def test_edited_constants_are_other_runs(whole, monkeypatch):
     assert len(plan_sweep(matrix(), whole).todo) == 2
 
 
-def test_a_run_half_written_is_not_done(whole, tmp_path):
+def test_half_written_run_is_not_done(whole, tmp_path):
     (job,) = plan_sweep(matrix(seeds=[0]), tmp_path).todo
     partial = tmp_path / f".20260101-000000-{job.name}-abc"
     partial.mkdir()
@@ -105,7 +106,7 @@ def test_a_run_half_written_is_not_done(whole, tmp_path):
     assert plan_sweep(matrix(seeds=[0]), tmp_path).todo == [job]
 
 
-def test_a_failing_run_is_told_and_does_not_stop_the_others(tmp_path, monkeypatch):
+def test_failing_run_is_reported_and_does_not_stop_the_others(tmp_path, monkeypatch):
     def broken(*arguments, **more):
         raise ZeroDivisionError("a\nb")
 
@@ -136,14 +137,14 @@ def test_a_failing_run_is_told_and_does_not_stop_the_others(tmp_path, monkeypatc
     assert len(table(tmp_path)) == 1
 
 
-def test_what_cannot_begin_is_told_and_does_not_stop_the_others(tmp_path):
+def test_refused_job_is_reported_and_does_not_stop_the_others(tmp_path):
     words = ("--methods", "conditional,diffuser", "--seeds", "1", "--runs", tmp_path)
     result = cdiff("sweep", "--task", "gaussian2d", *words, code=1)
     assert "conditional: this task's score is exact" in result.stderr
     assert [row["method"] for row in table(tmp_path)] == ["diffuser"]
 
 
-def test_a_job_runs_on_one_thread_and_leaves_the_number_as_it_was(tmp_path, monkeypatch):
+def test_job_runs_on_one_thread_and_restores_their_number(tmp_path, monkeypatch):
     seen = []
 
     def plan_run(*_, **__):
@@ -159,7 +160,7 @@ def test_a_job_runs_on_one_thread_and_leaves_the_number_as_it_was(tmp_path, monk
     torch.set_num_threads(before)
 
 
-def test_the_progress_table_counts(tmp_path):
+def test_progress_table_counts_done_failed_and_all_runs(tmp_path):
     plan = plan_sweep(matrix(("projected", "conditional")), tmp_path)
     assert (len(plan.todo), len(plan.refused)) == (2, 2)
     shown = progress_table([*plan.refused, Outcome(plan.todo[0], 2.0)], plan, 0.0)
@@ -173,17 +174,13 @@ def test_the_progress_table_counts(tmp_path):
     ]
 
 
-def test_a_diverged_episode_is_no_clean_cell_neither_when_made_nor_when_it_was_there(
-    tmp_path, monkeypatch
-):
-    control = receding_horizon.control
-
-    def spoilt(controller, seeds, *rest, **more):
+def test_diverged_episode_is_reported_when_made_and_when_it_was_there(tmp_path, monkeypatch):
+    def spoilt(controller, task, seeds, *rest, **more):
         """The plans of seed 1 are not finite after its first steps."""
-        done = control(controller, seeds, *rest, steps=3, **more)
+        done = act(controller, task, seeds, *rest, steps=3, **more)
         return replace(done, diverged=np.array([seed == 1 for seed in seeds]))
 
-    monkeypatch.setattr(rollout, "control", spoilt)
+    monkeypatch.setattr(rollout, "rollout", spoilt)
     words = (
         "sweep",
         "--task",
@@ -229,7 +226,7 @@ def test_a_diverged_episode_is_no_clean_cell_neither_when_made_nor_when_it_was_t
         (["--address", "localhost:1"], "--address: the runs are local"),
     ],
 )
-def test_a_bad_option_is_one_clear_line_and_writes_nothing(words, message, tmp_path):
+def test_bad_option_is_refused_in_one_line_and_writes_nothing(words, message, tmp_path):
     stderr = cdiff("sweep", *words, "--runs", tmp_path / "runs", code=2).stderr
     assert message in stderr
     assert len(stderr.strip().splitlines()) == 1
@@ -237,7 +234,7 @@ def test_a_bad_option_is_one_clear_line_and_writes_nothing(words, message, tmp_p
 
 
 @pytest.mark.parametrize("backend", ["ray", "dask"])
-def test_a_backend_that_is_not_installed_names_its_extra(backend, tmp_path, monkeypatch):
+def test_backend_that_is_not_installed_names_its_extra(backend, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, backend, None)
     words = ("--task", "gaussian2d", "--methods", "diffuser", "--seeds", "1", "--backend", backend)
     assert (
@@ -277,21 +274,19 @@ RAY = (
 )
 
 
-def test_an_address_where_no_cluster_answers_is_one_clear_line(tmp_path, monkeypatch):
+def test_address_where_no_cluster_answers_is_refused_in_one_line(tmp_path, monkeypatch):
     cluster(monkeypatch)
     stderr = cdiff(*RAY, "--runs", tmp_path, code=2).stderr
     assert stderr == "error: --address head:1: no ray cluster answers there: nobody there\n"
 
 
-def test_more_jobs_than_a_ray_cluster_has_cpus_would_wait_for_ever_and_are_refused(
-    tmp_path, monkeypatch
-):
+def test_more_jobs_than_a_ray_cluster_has_cpus_are_refused(tmp_path, monkeypatch):
     cluster(monkeypatch, cpus=2)
     stderr = cdiff(*RAY, "--jobs", 3, "--runs", tmp_path, code=2).stderr
     assert "--jobs: the Ray cluster has 2 CPUs, one for each job; found 3" in stderr
 
 
-def test_names_are_checked_before_anything_is_resolved(monkeypatch, tmp_path):
+def test_names_of_a_sweep_are_checked_before_anything_is_resolved(monkeypatch, tmp_path):
     monkeypatch.setattr(sweep, "resolve", None)
     with pytest.raises(CdiffError, match="no method"):
         plan_sweep(matrix(("none",)), tmp_path)

@@ -100,17 +100,14 @@ def edit(path, change):
     path.write_text(json.dumps(proof))
 
 
-# verdicts -------------------------------------------------------------------------------------------------------------
-
-
-def test_a_safe_run_is_certified(tmp_path):
+def test_safe_run_is_certified(tmp_path):
     result = verify(make_run(tmp_path / "run", ROUND), code=0)
     assert "certified      " in result.stdout
     assert "1 of 1 plans safe at the waypoints, 1 of 1 between them" in result.stdout
     assert result.stderr == ""
 
 
-def test_a_plan_across_a_disc_is_not_certified_but_by_its_waypoints(tmp_path):
+def test_plan_across_a_disc_is_certified_at_its_waypoints_only(tmp_path):
     run = make_run(tmp_path / "run", ROUND, ACROSS)
     result = verify(run, code=1)
     assert "NOT certified" in result.stdout
@@ -119,7 +116,7 @@ def test_a_plan_across_a_disc_is_not_certified_but_by_its_waypoints(tmp_path):
     assert "certified      " in verify(run, "--waypoints", code=0).stdout
 
 
-def test_json_says_the_same_for_machines(tmp_path):
+def test_json_holds_the_same_results(tmp_path):
     run = make_run(tmp_path / "run", ROUND, ACROSS)
     (report,) = json.loads(verify(run, "--json", code=1).stdout)["runs"]
     assert (report["run"], report["certified"], report["matches"], report["notes"]) == (
@@ -138,31 +135,31 @@ def test_json_says_the_same_for_machines(tmp_path):
     assert (cut["constraint"], cut["safe"]) == ("cut", 2)
 
 
-def test_a_barrier_and_a_general_quadric_are_recompiled_from_the_record(tmp_path):
+def test_barrier_and_general_quadric_are_compiled_from_run_yaml(tmp_path):
     verify(make_run(tmp_path / "run", ROUND, kinds=(SLOW, SADDLE)), code=0)
 
 
 @pytest.mark.parametrize("name", ["1e3", "on", "[/bold]", "pillar@3-4", "säule"])
-def test_a_constraint_may_have_any_name(name, tmp_path):
+def test_constraint_may_have_any_name(name, tmp_path):
     run = make_run(tmp_path / "run", ROUND, kinds=(DISC | {"name": name}, CUT_CORNER))
     assert name in verify(run, code=0).stdout
 
 
-def test_a_barrier_used_up_too_fast_is_not_certified(tmp_path):
+def test_plan_that_violates_a_barrier_is_not_certified(tmp_path):
     rush = [(0.0, 2.0, 0.0, 0.0), (0.0, 2.0, 0.75, 0.0), (0.0, 2.0, 0.75, 0.0)]
     result = verify(make_run(tmp_path / "run", rush, kinds=(SLOW,)), code=1)
     assert "0.25 at 0.01 s, seed 0" in result.stdout
     assert "0 of 1 plans safe at the waypoints, 1 of 1 between them" in result.stdout
 
 
-def test_an_executed_violation_is_told_and_leaves_the_plans_certified(tmp_path):
+def test_executed_violation_is_shown_and_leaves_the_plans_certified(tmp_path):
     path = [[*ROUND, (0.0, 0.25, 0.0, 0.0), (np.nan,) * 4]]
     result = verify(make_run(tmp_path / "run", ROUND, rollout=path), code=0)
     assert "0.75 at 0.03 s, seed 0" in result.stdout
     assert "1 of 1 between them, 0 of 1 as executed" in result.stdout
 
 
-def test_a_folder_of_runs_is_verified_run_by_run(tmp_path):
+def test_folder_of_runs_is_verified_run_by_run(tmp_path):
     make_run(tmp_path / "a", ROUND)
     make_run(tmp_path / "b", ACROSS)
     make_run(tmp_path / ".partial", ACROSS)
@@ -174,7 +171,7 @@ def test_a_folder_of_runs_is_verified_run_by_run(tmp_path):
     ]
 
 
-def test_an_unreadable_run_among_others_hides_none_of_them(tmp_path):
+def test_unreadable_run_hides_none_of_the_others(tmp_path):
     make_run(tmp_path / "a", ROUND)
     (make_run(tmp_path / "b", ROUND) / "run.yaml").unlink()
     result = verify(tmp_path, code=2)
@@ -182,22 +179,19 @@ def test_an_unreadable_run_among_others_hides_none_of_them(tmp_path):
     assert "run.yaml is missing" in result.stderr
 
 
-# alterations ----------------------------------------------------------------------------------------------------------
-
-
-def test_an_altered_plan_is_found_even_where_it_is_safe(tmp_path):
+def test_altered_plan_is_detected_even_where_it_is_safe(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
     save(run / "plan.npz", [[(x, y + 0.1, vx, vy) for x, y, vx, vy in ROUND]])
     assert "plan.npz was altered after its certificate was written" in verify(run, code=1).stdout
 
 
-def test_a_plan_taken_away_is_found(tmp_path):
+def test_removed_plan_is_detected(tmp_path):
     run = make_run(tmp_path / "run", ROUND, ACROSS)
     save(run / "plan.npz", [ROUND])
     assert "plan.npz was altered" in verify(run, code=1).stdout
 
 
-def test_an_altered_rollout_is_found(tmp_path):
+def test_altered_rollout_is_detected(tmp_path):
     run = make_run(tmp_path / "run", ROUND, rollout=[[*ROUND, (0.0, 0.25, 0.0, 0.0)]])
     save(run / "rollout.npz", [ROUND])
     assert "rollout.npz was altered" in verify(run, code=1).stdout
@@ -245,14 +239,14 @@ EDITS = {
 
 
 @pytest.mark.parametrize("case", EDITS)
-def test_an_edited_certificate_is_found(case, tmp_path):
+def test_edited_certificate_is_detected(case, tmp_path):
     change, said = EDITS[case]
     run = make_run(tmp_path / "run", ROUND, ACROSS)
     edit(run / "certificate.json", change)
     assert said in verify(run, "--waypoints", code=1).stdout
 
 
-def test_constraints_relaxed_in_the_record_are_found(tmp_path):
+def test_relaxed_constraints_in_run_yaml_are_detected(tmp_path):
     run = make_run(tmp_path / "run", ACROSS)
     text = (run / "run.yaml").read_text()
     (run / "run.yaml").write_text(text.replace("radius: 1.0", "radius: 0.1"))
@@ -261,7 +255,7 @@ def test_constraints_relaxed_in_the_record_are_found(tmp_path):
     )
 
 
-def test_rounding_in_the_last_bit_is_no_edit(tmp_path):
+def test_rounding_in_the_last_bit_is_no_mismatch(tmp_path):
     run = make_run(tmp_path / "run", ROUND, ACROSS)
     edit(
         run / "certificate.json",
@@ -270,7 +264,7 @@ def test_rounding_in_the_last_bit_is_no_edit(tmp_path):
     assert verify_run(run).mismatch == ()
 
 
-def test_a_constraint_file_edited_since_is_noted_and_not_used(tmp_path):
+def test_constraint_file_edited_since_is_noted_and_not_used(tmp_path):
     run = make_run(tmp_path / "run", ACROSS)
     file = run / "constraints.yaml"
     file.write_text(file.read_text().replace("radius: 1.0", "radius: 0.1"))
@@ -281,9 +275,6 @@ def test_a_constraint_file_edited_since_is_noted_and_not_used(tmp_path):
     assert "cannot be read from here" in verify(run, code=1).stderr
 
 
-# what cannot be read --------------------------------------------------------------------------------------------------
-
-
 def test_no_such_run_says_what_to_do(tmp_path):
     assert "no such run; make one first: cdiff plan" in refused(tmp_path / "none")
     assert "no run here" in refused(tmp_path)
@@ -292,7 +283,7 @@ def test_no_such_run_says_what_to_do(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["run.yaml", "plan.npz", "certificate.json", "rollout.npz"])
-def test_a_missing_file_is_named(name, tmp_path):
+def test_missing_file_is_named(name, tmp_path):
     run = make_run(tmp_path / "run", ROUND, rollout=[ROUND])
     (run / name).unlink()
     assert f"{name} is missing" in refused(run)
@@ -300,7 +291,7 @@ def test_a_missing_file_is_named(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["run.yaml", "plan.npz", "certificate.json", "rollout.npz"])
 @pytest.mark.parametrize("how", ["truncated", "empty", "noise", "a folder"])
-def test_a_damaged_file_gets_one_line(name, how, tmp_path):
+def test_damaged_file_is_refused_in_one_line(name, how, tmp_path):
     run = make_run(tmp_path / "run", ROUND, rollout=[ROUND])
     content = (run / name).read_bytes()
     (run / name).unlink()
@@ -316,7 +307,7 @@ def test_a_damaged_file_gets_one_line(name, how, tmp_path):
     assert name in refused(run)
 
 
-def test_every_flipped_byte_of_a_plan_is_damage_or_an_alteration(tmp_path):
+def test_every_flipped_byte_of_a_plan_is_detected(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
     content = (run / "plan.npz").read_bytes()
     for at in range(0, len(content), 17):
@@ -360,19 +351,19 @@ def test_arrays_that_are_not_of_a_plan_are_refused(case, tmp_path):
     assert said in refused(run)
 
 
-def test_arrays_under_other_names_are_of_another_version(tmp_path):
+def test_arrays_under_other_names_are_refused_as_another_version(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
     np.savez_compressed(run / "plan.npz", plans=np.zeros((1, 3, 4)), seed=np.zeros(1, int))
     assert "plan.npz: lacks x, layout" in refused(run)
 
 
-def test_a_bare_array_is_no_plan(tmp_path):
+def test_bare_array_is_refused(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
     (run / "plan.npz").write_bytes(bare(np.zeros((1, 3, 4))))
     assert "plan.npz" in refused(run)
 
 
-def test_states_lost_before_an_episodes_end_are_refused(tmp_path):
+def test_states_that_are_not_finite_before_the_end_of_an_episode_are_refused(tmp_path):
     run = make_run(tmp_path / "run", ROUND, rollout=[ROUND])
     save(run / "rollout.npz", [[ROUND[0], (np.nan,) * 4, ROUND[2]]])
     assert "rollout.npz: the state of seed 0 is not finite" in refused(run)
@@ -380,7 +371,7 @@ def test_states_lost_before_an_episodes_end_are_refused(tmp_path):
     assert "rollout.npz: the state of seed 0 is not finite" in refused(run)
 
 
-def test_a_rollout_of_other_seeds_is_refused(tmp_path):
+def test_rollout_of_other_seeds_is_refused(tmp_path):
     run = make_run(tmp_path / "run", ROUND, rollout=[ROUND])
     save(run / "rollout.npz", [ROUND], seed=np.array([7]))
     assert "its seeds are not those of plan.npz" in refused(run)
@@ -402,7 +393,7 @@ RECORDS = {
 
 
 @pytest.mark.parametrize("case", RECORDS)
-def test_a_record_of_other_keys_gets_its_line_and_field(case, tmp_path):
+def test_bad_run_yaml_is_refused_with_line_and_field(case, tmp_path):
     before, after, said = RECORDS[case]
     run = make_run(tmp_path / "run", ROUND)
     text = (run / "run.yaml").read_text()
@@ -413,7 +404,7 @@ def test_a_record_of_other_keys_gets_its_line_and_field(case, tmp_path):
     assert said in line
 
 
-def test_a_certificate_of_another_format_is_not_compared(tmp_path):
+def test_certificate_of_another_format_is_refused(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
     for other in ("[]", "{}", '{"format": 2}', "null", '{"format": 1}'):
         (run / "certificate.json").write_text(other)
@@ -422,17 +413,22 @@ def test_a_certificate_of_another_format_is_not_compared(tmp_path):
     assert "damaged" in refused(run)
 
 
-# cost -----------------------------------------------------------------------------------------------------------------
+HEAVY = (
+    *("cdiff_cli.models.networks", "cdiff_cli.training.fit", "cdiff_cli.planning.open_loop"),
+    *("safetensors", "gymnasium", "mujoco", "matplotlib", "scipy", "qpsolvers"),
+)
 
 
 def test_verify_loads_no_network_no_simulator_and_no_plotting(tmp_path):
     run = make_run(tmp_path / "run", ROUND)
-    code = (
-        "import sys; from typer.testing import CliRunner; from cdiff_cli.cli import app; "
-        f"result = CliRunner().invoke(app, ['verify', {str(run)!r}]); assert result.exit_code == 0, result.output; "
-        "heavy = ('cdiff_cli.models.networks', 'cdiff_cli.training.fit', 'cdiff_cli.planning.open_loop', 'safetensors', 'gymnasium', 'mujoco', "
-        "'matplotlib', 'scipy', 'qpsolvers'); assert [m for m in heavy if m in sys.modules] == []"
-    )
+    code = f"""
+import sys
+from typer.testing import CliRunner
+from cdiff_cli.cli import app
+result = CliRunner().invoke(app, ["verify", {str(run)!r}])
+assert result.exit_code == 0, result.output
+assert [name for name in {HEAVY!r} if name in sys.modules] == []
+"""
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=Path(__file__).parents[2],

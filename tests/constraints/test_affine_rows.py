@@ -15,7 +15,7 @@ H = 6
 
 @settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.05, 1.0), st.booleans())
-def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, alpha, high_order):
+def test_condensed_rows_equal_the_rows_of_the_parts_about_any_centre(seed, alpha, high_order):
     """float64: a hundred additions of numbers of size one stay within 1e-12."""
     draw = torch.Generator().manual_seed(seed)
     a, b = torch.randn(2, 3, generator=draw, dtype=F64), torch.randn(2, generator=draw, dtype=F64)
@@ -38,13 +38,13 @@ def test_values_pulls_and_sizes_are_those_of_the_parts_about_any_centre(seed, al
     torch.testing.assert_close(fast_size.expand_as(size), size)
 
 
-def test_what_is_not_affine_is_left_part_by_part():
+def test_constraint_with_a_part_that_is_not_affine_is_not_condensed():
     assert Constraint(()).condense(H, 2) is None
-    assert waypoints(ball(1)).condense(H, 2) is None
+    assert waypoints(ball("outside")).condense(H, 2) is None
     both = Constraint(
         (
             *chain(HalfSpace(vec(0.0, 1.0), vec(0.75).squeeze()), 0.5).parts,
-            *waypoints(ball(1)).parts,
+            *waypoints(ball("outside")).parts,
         )
     )
     assert both.condense(H, 2) is None

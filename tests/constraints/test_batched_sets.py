@@ -1,5 +1,7 @@
-"""Levels whose numbers differ by plan and by waypoint, as pull_back to windows relative to the present state makes them: they are
-what the fixed level is to each plan and waypoint alone.
+"""State sets whose parameters differ by plan and by waypoint.
+
+pull_back into a frame relative to the present state produces them. Each plan and waypoint gets the
+values that it gets alone.
 """
 
 import numpy as np
@@ -11,16 +13,9 @@ from hypothesis import strategies as st
 from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import converted, segment_max, selected
 from cdiff_cli.constraints.segments import OnSegments
-from cdiff_cli.constraints.state_sets import (
-    Ellipsoid,
-    HalfSpace,
-    Quadric,
-    QuadricInFrame,
-    converted,
-    segment_max,
-    selected,
-)
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, QuadricInFrame
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.projection.project import project
@@ -55,7 +50,9 @@ ROUNDING = 1e-9  # a few operations of float64, with 1 / scale up to 10 and 1 / 
 
 
 def frame(seed, shape, shared=False):
-    """Centre [batch | 1, horizon | 1, 2] and scale [horizon | 1, 2]; shared: one scale for both coordinates."""
+    """Centre [batch | 1, horizon | 1, 2] and scale [horizon | 1, 2]; shared: one scale for both
+    coordinates.
+    """
     scale = normal(seed + 2, shape[1], 2).abs() + 0.2
     return normal(seed + 1, *shape, 2), scale[:, :1].expand(-1, 2) if shared else scale
 
@@ -77,13 +74,13 @@ def at(level, plan, tau):
     return type(level)(**{**vars(level), **new})
 
 
-# the same function ----------------------------------------------------------------------------------------------------
+# the same function --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(AROUND))
 @quick
 @given(seed=seeds, shape=frames)
-def test_pull_back_by_plan_and_waypoint_commutes_with_evaluation(kind, seed, shape):
+def test_pull_back_with_a_frame_per_plan_and_waypoint_commutes_with_evaluation(kind, seed, shape):
     g, z = AROUND[kind], normal(seed, 3, HORIZON, 2)
     centre, scale = frame(seed, shape)
     back, x = pull_back(g, centre, scale), centre + scale * z
@@ -98,7 +95,7 @@ def test_pull_back_by_plan_and_waypoint_commutes_with_evaluation(kind, seed, sha
 @pytest.mark.parametrize("kind", list(AROUND))
 @quick
 @given(seed=seeds, shape=frames)
-def test_pulls_by_plan_and_waypoint_equal_autograd(kind, seed, shape):
+def test_pulls_in_a_frame_per_plan_and_waypoint_equal_autograd(kind, seed, shape):
     g, z = pull_back(AROUND[kind], *frame(seed, shape)), normal(seed, 3, HORIZON, 2)
     rows, pull, size = g.linearise(z)
     w = normal(seed + 3, *rows.shape)
@@ -114,7 +111,7 @@ def test_pulls_by_plan_and_waypoint_equal_autograd(kind, seed, shape):
 @pytest.mark.parametrize("kind", [kind for kind in AROUND if kind != "opaque"])
 @quick
 @given(seed=seeds)
-def test_row_sizes_by_waypoint_bound_the_eigenvalues(kind, seed):
+def test_row_bounds_in_a_frame_per_waypoint_bound_the_eigenvalues(kind, seed):
     g, z = (
         pull_back(AROUND[kind], *frame(seed, (1, HORIZON), shared=True)),
         normal(seed, 1, HORIZON, 2),
@@ -133,7 +130,7 @@ def test_row_sizes_by_waypoint_bound_the_eigenvalues(kind, seed):
 @pytest.mark.parametrize("kind", list(AROUND))
 @quick
 @given(seed=seeds)
-def test_two_frames_one_after_the_other_are_their_composition(kind, seed):
+def test_pull_back_into_two_frames_equals_pull_back_into_their_composition(kind, seed):
     g, z = AROUND[kind], normal(seed, 3, HORIZON, 2)
     outer, inner = frame(seed, (1, 1)), frame(seed + 3, (3, HORIZON))
     twice = pull_back(pull_back(g, outer[0][0, 0], outer[1][0]), *inner)
@@ -143,7 +140,7 @@ def test_two_frames_one_after_the_other_are_their_composition(kind, seed):
 
 
 @pytest.mark.parametrize("kind", list(AROUND))
-def test_some_plans_of_the_batch_keep_their_own_numbers(kind):
+def test_selected_plans_keep_their_parameters(kind):
     g, z = pull_back(AROUND[kind], *frame(0, (3, HORIZON))), normal(0, 3, HORIZON, 2)
     for which in (torch.tensor([2, 0]), torch.tensor([True, False, True])):
         torch.testing.assert_close(g.select(which)(z[which]), g(z)[which], atol=1e-12, rtol=0)
@@ -154,7 +151,7 @@ def test_some_plans_of_the_batch_keep_their_own_numbers(kind):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in AROUND if kind != "opaque"])
-def test_numbers_by_plan_move_to_float32(kind):
+def test_parameters_per_plan_are_converted_to_float32(kind):
     g, z = pull_back(AROUND[kind], *frame(0, (3, HORIZON))), normal(0, 3, HORIZON, 2)
     small = g.to(z.float())(z.float())
     assert small.dtype == torch.float32
@@ -166,7 +163,7 @@ def test_numbers_by_plan_move_to_float32(kind):
 @pytest.mark.parametrize("name", list(LEVELS))
 @quick
 @given(seed=seeds)
-def test_between_waypoints_a_moving_level_moves_evenly(name, seed):
+def test_moving_state_set_moves_linearly_between_waypoints(name, seed):
     """Dense points of the segment against the level at the place that it has reached there."""
     level, x, offset = LEVELS[name], normal(seed, 3, 2, 2), normal(seed + 5, 3, 2, 2)
     bound = segment_max(level.pull_back(-offset, torch.ones(2, dtype=F64)), x)[:, 0]
@@ -179,9 +176,9 @@ def test_between_waypoints_a_moving_level_moves_evenly(name, seed):
     )  # slopes of about 10, points 1 / 2000 of a segment apart
 
 
-def test_a_path_that_crosses_the_way_of_a_ball_is_safe_if_the_ball_is_gone():
+def test_path_across_the_track_of_a_moving_ball_is_safe_after_the_ball_has_passed():
     x = vec(-2.0, 0.0, 2.0, 0.0).reshape(1, 2, 2)
-    standing = ball(1, centre=(0.0, 0.0), radius=1.0)
+    standing = ball("outside", centre=(0.0, 0.0), radius=1.0)
     assert float(segment_max(standing, x)) == pytest.approx(1.0)
     offset = vec(0.0, -3.0, 0.0, 3.0).reshape(
         1, 2, 2
@@ -193,7 +190,7 @@ def test_a_path_that_crosses_the_way_of_a_ball_is_safe_if_the_ball_is_gone():
     assert float(segment_max(standing.pull_back(-offset, torch.ones(2, dtype=F64)), x)) < -1.5
 
 
-def test_dynamics_by_plan_and_waypoint_commute_with_evaluation():
+def test_dynamics_in_a_frame_per_plan_and_waypoint_commute_with_evaluation():
     A, B = torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=F64), vec(0.0, 0.1)[:, None]
     part = LinearDynamicsConstraint.from_dynamics(
         "d", LinearDynamics(A, B, vec(0.0, 0.0), vec(-1.0), vec(1.0)), 1e-3
@@ -210,13 +207,13 @@ def test_dynamics_by_plan_and_waypoint_commute_with_evaluation():
     )
 
 
-# projections ----------------------------------------------------------------------------------------------------------
+# projections --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", list(LEVELS))
 @quick
 @given(seed=seeds, shape=frames)
-def test_the_nearest_waypoints_are_those_of_each_plan_and_waypoint_alone(name, seed, shape):
+def test_projection_at_waypoints_of_a_batch_equals_that_of_each_waypoint_alone(name, seed, shape):
     level, z = LEVELS[name].pull_back(*frame(seed, shape)), normal(seed, 3, HORIZON, 2)
     x = free_projection(Constraint((AtWaypoints("w", level),)), z)
     for plan in range(3):
@@ -235,7 +232,9 @@ def test_the_nearest_waypoints_are_those_of_each_plan_and_waypoint_alone(name, s
 @pytest.mark.parametrize("start", ["free", "start pinned"])
 @quick
 @given(seed=seeds, alpha=st.floats(0.01, 1.0))
-def test_chains_that_differ_by_plan_are_those_of_each_plan_alone(kind, start, seed, alpha):
+def test_projection_onto_barriers_that_differ_by_plan_equals_that_of_each_plan_alone(
+    kind, start, seed, alpha
+):
     level, z = moving(LEVELS[kind], seed, 3, 1), normal(seed, 3, 7, 2)
     pins = pin(z, 0) if start == "start pinned" else Pins.none(z)
     x = project(chain(level, alpha), z, pins)
@@ -246,8 +245,8 @@ def test_chains_that_differ_by_plan_are_those_of_each_plan_alone(kind, start, se
 
 @quick
 @given(seed=seeds)
-def test_segments_outside_balls_that_differ_by_plan_are_those_of_each_plan_alone(seed):
-    level, z = moving(ball(1), seed, 3, 1), normal(seed, 3, 7, 2)
+def test_projection_around_balls_that_differ_by_plan_equals_that_of_each_plan_alone(seed):
+    level, z = moving(ball("outside"), seed, 3, 1), normal(seed, 3, 7, 2)
     x = free_projection(Constraint((OnSegments("s", level),)), z)
     for i in range(3):
         alone = free_projection(Constraint((OnSegments("s", at(level, i, 0)),)), z[i : i + 1])
@@ -256,24 +255,29 @@ def test_segments_outside_balls_that_differ_by_plan_are_those_of_each_plan_alone
 
 @quick
 @given(seed=seeds)
-def test_segments_of_a_moving_ball_are_those_of_a_resting_one_in_its_own_frame(seed):
+def test_projection_around_a_moving_ball_equals_that_around_a_fixed_one_in_its_frame(seed):
     """And in windows of another scale at each waypoint, distances are then those of the window."""
     z, offset = normal(seed, 3, 7, 2), 0.3 * normal(seed + 5, 3, 7, 2)
     x = free_projection(
-        Constraint((OnSegments("s", ball(1).pull_back(-offset, torch.ones(2, dtype=F64))),)), z
+        Constraint(
+            (OnSegments("s", ball("outside").pull_back(-offset, torch.ones(2, dtype=F64))),)
+        ),
+        z,
     )
-    resting = free_projection(Constraint((OnSegments("s", ball(1)),)), z - offset)
+    resting = free_projection(Constraint((OnSegments("s", ball("outside")),)), z - offset)
     torch.testing.assert_close(x - offset, resting, atol=1e-9, rtol=0)
-    back = pull_back(Constraint((OnSegments("s", ball(1)),)), *frame(seed, (3, 7), shared=True))
+    back = pull_back(
+        Constraint((OnSegments("s", ball("outside")),)), *frame(seed, (3, 7), shared=True)
+    )
     assert float(back(free_projection(back, z)).max()) <= 1e-7  # what project promises
 
 
-# chains with a scale a waypoint --------------------------------------------------------------------------------------
+# chains with a scale a waypoint -------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds, alpha=st.floats(0.01, 1.0), n=st.integers(2, 20), pinned=st.booleans())
-def test_a_chain_over_a_half_space_with_a_scale_a_waypoint_agrees_with_proxqp(
+def test_barrier_over_a_half_space_with_a_scale_per_waypoint_agrees_with_proxqp(
     seed, alpha, n, pinned
 ):
     z = normal(seed, 2, n, 2)
@@ -292,13 +296,15 @@ def test_a_chain_over_a_half_space_with_a_scale_a_waypoint_agrees_with_proxqp(
 
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds, alpha=st.floats(0.01, 1.0), n=st.integers(2, 20), pinned=st.booleans())
-def test_a_chain_outside_a_ball_with_a_scale_a_waypoint_agrees_with_proxqp_along_the_radii(
+def test_barrier_outside_a_ball_with_a_scale_per_waypoint_agrees_with_proxqp(
     seed, alpha, n, pinned
 ):
-    """h_k = s_k (|z_k - c_k| - r_k): the nearest trajectory moves radially, and |z_k - c_k| solves a QP with bounds at 0."""
+    """h_k = s_k (|z_k - c_k| - r_k): the nearest trajectory moves radially, and |z_k - c_k| solves
+    a QP with bounds at 0.
+    """
     z = normal(seed, 2, n, 2)
     centre, scale = normal(seed + 1, 2, n, 2), (normal(seed + 2, n, 1).abs() + 0.2).expand(-1, 2)
-    g = pull_back(chain(ball(1), alpha), centre, scale)
+    g = pull_back(chain(ball("outside"), alpha), centre, scale)
     x = project(g, z, pin(z, 0) if pinned else Pins.none(z))
     level, s, gamma = g.parts[0].level, scale[:, 0].numpy(), 1 - alpha
     away, ended = (((v - level.centre).norm(dim=-1)).numpy() for v in (z, x))
@@ -317,11 +323,15 @@ def test_a_chain_outside_a_ball_with_a_scale_a_waypoint_agrees_with_proxqp_along
         )  # ProxQP's accuracy
 
 
-def test_radii_that_differ_by_waypoint_are_kept_by_hand():
+def test_waypoints_move_to_the_radius_of_their_waypoint():
     """alpha = 1 is clipping: each waypoint to its own radius."""
     radius = vec(1.0, 2.0, 3.0)
     level = Ellipsoid(
-        torch.eye(2, dtype=F64), torch.zeros(2, dtype=F64), radius[:, None].expand(3, 2), radius, 1
+        torch.eye(2, dtype=F64),
+        torch.zeros(2, dtype=F64),
+        radius[:, None].expand(3, 2),
+        radius,
+        "outside",
     )
     z = vec(0.5, 0.0, 0.5, 0.0, 5.0, 0.0).reshape(1, 3, 2)
     x = project(chain(level, 1.0), z, pin(z, 0))
@@ -330,10 +340,14 @@ def test_radii_that_differ_by_waypoint_are_kept_by_hand():
     )
 
 
-def test_a_ball_that_shrinks_along_the_horizon_is_never_left_through_its_centre():
+def test_no_waypoint_leaves_a_shrinking_ball_through_its_centre():
     radius = vec(3.0, 0.1, 0.1)
     level = Ellipsoid(
-        torch.eye(2, dtype=F64), torch.zeros(2, dtype=F64), radius[:, None].expand(3, 2), radius, 1
+        torch.eye(2, dtype=F64),
+        torch.zeros(2, dtype=F64),
+        radius[:, None].expand(3, 2),
+        radius,
+        "outside",
     )
     z = torch.full((1, 3, 2), 0.01, dtype=F64)
     x = project(chain(level, 0.1), z, Pins.none(z))
@@ -341,11 +355,11 @@ def test_a_ball_that_shrinks_along_the_horizon_is_never_left_through_its_centre(
     assert bool((x * z >= 0).all())
 
 
-# a start that is unsafe already ---------------------------------------------------------------------------------------
+# a start that is unsafe already -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_from_an_unsafe_start_a_chain_over_a_half_space_asks_for_recovery(dtype):
+def test_barrier_over_a_half_space_recovers_from_an_unsafe_start(dtype):
     g = chain(HalfSpace(vec(-1.0), num(0.0)), 0.5)  # h = x
     z = vec(-4.0, -3.0, -3.0, 1.0).reshape(1, 4, 1).to(dtype)
     x = project(g.to(z), z, pin(z, 0))
@@ -357,8 +371,8 @@ def test_from_an_unsafe_start_a_chain_over_a_half_space_asks_for_recovery(dtype)
 @pytest.mark.parametrize("start", [(0.0, 0.0), (0.4, 0.0), (1e-9, 0.0)])
 @settings(max_examples=25, deadline=None)
 @given(seed=seeds, alpha=st.floats(0.01, 1.0))
-def test_from_inside_a_ball_the_chain_leads_out(start, seed, alpha):
-    g = chain(ball(1, centre=(0.0, 0.0), radius=1.0), alpha)
+def test_barrier_leads_out_of_a_ball(start, seed, alpha):
+    g = chain(ball("outside", centre=(0.0, 0.0), radius=1.0), alpha)
     z = normal(seed, 2, 9, 2, scale=0.3)
     z[:, 0] = vec(*start)
     x = project(g, z, pin(z, 0))
@@ -368,18 +382,18 @@ def test_from_inside_a_ball_the_chain_leads_out(start, seed, alpha):
     assert float(g(x).max()) <= 1e-12  # rounding
 
 
-def test_a_path_that_rests_at_the_centre_leaves_along_the_first_axis():
+def test_path_at_rest_at_the_centre_of_a_ball_leaves_along_the_first_axis():
     z = torch.zeros(1, 3, 2, dtype=F64)
-    x = project(chain(ball(1, centre=(0.0, 0.0), radius=2.0), 0.5), z, pin(z, 0))
+    x = project(chain(ball("outside", centre=(0.0, 0.0), radius=2.0), 0.5), z, pin(z, 0))
     torch.testing.assert_close(
         x, vec(0.0, 0.0, 1.0, 0.0, 1.5, 0.0).reshape(1, 3, 2), atol=1e-12, rtol=0
     )
 
 
-# what has no closed form ---------------------------------------------------------------------------------------------
+# what has no closed form --------------------------------------------------------------------------
 
 
-def test_a_chain_over_an_ellipsoid_that_differs_by_plan_falls_back_plan_by_plan():
+def test_barrier_over_batched_ellipsoid_is_projected_plan_by_plan():
     level = LEVELS["outside ellipsoid"]
     z = normal(0, 2, 3, 2)
     both = Constraint((DiscreteBarrier("c", moving(level, 0, 2, 3), 0.4),))
@@ -389,13 +403,13 @@ def test_a_chain_over_an_ellipsoid_that_differs_by_plan_falls_back_plan_by_plan(
     torch.testing.assert_close(x[1:2], alone, atol=1e-6, rtol=0)
 
 
-def test_rows_of_which_only_the_function_is_known_take_a_frame_too():
+def test_black_box_can_be_pulled_back_into_a_frame_per_plan():
     g, z = opaque(lambda x: x[..., 0] - 1.0), normal(0, 2, 3, 2)
     back = pull_back(g, *frame(0, (2, 3)))
     assert float(back(free_projection(back, z)).max()) <= 1e-5  # what the fallback promises
 
 
-def test_a_quadric_in_many_frames_stays_one_quadric():
+def test_quadric_in_a_frame_per_waypoint_keeps_one_matrix():
     level = LEVELS["general quadric"].pull_back(*frame(0, (3, HORIZON)))
     assert isinstance(level, QuadricInFrame)
     assert converted(level, torch.zeros(1)).quadric.P.dtype == torch.float32

@@ -1,4 +1,4 @@
-"""Barriers of relative degree 2: high-order chains and the look-ahead; short chains, which are written out at once."""
+"""Barriers of relative degree 2: high-order barriers and the look-ahead; short horizons."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,8 @@ from cdiff_cli.constraints.spec.kinds import Dcbf
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.constraints.waypoints import AtWaypoints
-from cdiff_cli.projection.project import has_exact_form, project
+from cdiff_cli.projection.project import project
+from cdiff_cli.projection.projectors import projector_of
 from cdiff_cli.projection.solvers.isotonic import SHORT, pool_violators
 from cdiff_cli.sampling.safediffuser import jacobian
 from tests.problems import (
@@ -41,7 +42,7 @@ def high(level, alpha, alpha2):
     return Constraint((DiscreteBarrier("c", level, alpha, alpha2),))
 
 
-# short chains ---------------------------------------------------------------------------------------------------------
+# short chains -------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -52,7 +53,7 @@ def high(level, alpha, alpha2):
     start=st.booleans(),
     by_plan=st.booleans(),
 )
-def test_short_chains_equal_pooled_violators(seed, n, alpha, start, by_plan):
+def test_max_min_formula_equals_pooled_violators(seed, n, alpha, start, by_plan):
     h, w = normal(seed, 3, n), normal(seed + 1, *((3, n) if by_plan else (n,))).abs() + 0.2
     fixed = torch.zeros(n, dtype=torch.bool)
     fixed[0] = start
@@ -69,7 +70,7 @@ def test_short_chains_equal_pooled_violators(seed, n, alpha, start, by_plan):
 
 @quick
 @given(seed=seeds, alpha=alphas)
-def test_weights_by_plan_are_those_of_each_plan_in_long_chains_too(seed, alpha):
+def test_long_barriers_with_weights_per_plan_equal_each_plan_alone(seed, alpha):
     n = SHORT + 8
     h, w, fixed = (
         normal(seed, 3, n),
@@ -80,18 +81,18 @@ def test_weights_by_plan_are_those_of_each_plan_in_long_chains_too(seed, alpha):
     torch.testing.assert_close(nearest_chain(h, 1 - alpha, w, fixed), alone, atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("level", [half_space(), ball(1)])
-def test_a_chain_that_holds_already_comes_back_bit_for_bit(level):
+@pytest.mark.parametrize("level", [half_space(), ball("outside")])
+def test_satisfied_barrier_leaves_the_plan_unchanged_to_the_bit(level):
     z = normal(0, 1, 1, 2).expand(2, 6, 2) + vec(-9.0, 9.0)
     g = Constraint((DiscreteBarrier("c", level, 0.5),))
     assert float(g(z).max()) < 0
     assert torch.equal(project(g, z, pin(z, 0)), z)
 
 
-# high-order chains ----------------------------------------------------------------------------------------------------
+# high-order chains --------------------------------------------------------------------------------
 
 
-def test_rows_by_hand():
+def test_rows_of_a_high_order_barrier_match_hand_calculation():
     """h = 4, 3, 2, 0: psi = h' - .5 h = 1, .5, -1; rows = .2 psi - psi'."""
     g = high(HalfSpace(vec(-1.0), num(0.0)), 0.5, 0.8)
     x = vec(4.0, 3.0, 2.0, 0.0).reshape(1, 4, 1)
@@ -103,8 +104,8 @@ def test_rows_by_hand():
 
 @quick
 @given(seed=seeds, alpha=alphas, alpha2=alphas)
-def test_written_pulls_equal_autograd_and_sizes_bound_the_eigenvalues(seed, alpha, alpha2):
-    for level in (half_space(), ball(1), ellipsoid(-1)):
+def test_pulls_of_high_order_barriers_equal_autograd_and_bounds_hold(seed, alpha, alpha2):
+    for level in (half_space(), ball("outside"), ellipsoid("inside")):
         g, x = high(level, alpha, alpha2), normal(seed, 1, 6, 2)
         rows, pull, size = g.linearise(x)
         w, leaf = normal(seed + 1, *rows.shape), x.clone().requires_grad_()
@@ -121,7 +122,7 @@ def test_written_pulls_equal_autograd_and_sizes_bound_the_eigenvalues(seed, alph
 
 @quick
 @given(seed=seeds, alpha=alphas, alpha2=alphas, n=st.integers(3, 16), pinned=st.booleans())
-def test_projection_over_a_half_space_agrees_with_proxqp(seed, alpha, alpha2, n, pinned):
+def test_high_order_barrier_over_a_half_space_agrees_with_proxqp(seed, alpha, alpha2, n, pinned):
     z = normal(seed, 2, n, 2)
     g = pull_back(
         high(half_space(), alpha, alpha2),
@@ -129,7 +130,7 @@ def test_projection_over_a_half_space_agrees_with_proxqp(seed, alpha, alpha2, n,
         normal(seed + 2, n, 2).abs() + 0.2,
     )
     pins = pin(z, 0) if pinned else Pins.none(z)
-    assert has_exact_form(g.parts[0])
+    assert projector_of(g.parts[0]) is not None
     x = project(g, z, pins)
     assert torch.equal(x[:, pins.held], z[:, pins.held])
     for i in range(2):
@@ -142,11 +143,11 @@ def test_projection_over_a_half_space_agrees_with_proxqp(seed, alpha, alpha2, n,
 
 @quick
 @given(seed=seeds, alpha=alphas, alpha2=alphas, n=st.integers(3, 16), pinned=st.booleans())
-def test_projection_outside_a_ball_agrees_with_proxqp_along_the_radii(
+def test_high_order_barrier_outside_a_ball_agrees_with_proxqp_along_the_radii(
     seed, alpha, alpha2, n, pinned
 ):
     z = normal(seed, 2, n, 2, scale=0.3) + vec(1.5, 0.0)
-    g = high(ball(1, centre=(0.0, 0.0), radius=0.7), alpha, alpha2)
+    g = high(ball("outside", centre=(0.0, 0.0), radius=0.7), alpha, alpha2)
     x = project(g, z, pin(z, 0) if pinned else Pins.none(z))
     away, ended = z.norm(dim=-1), x.norm(dim=-1)
     torch.testing.assert_close(x, z / away[..., None] * ended[..., None], atol=1e-8, rtol=0)
@@ -161,11 +162,11 @@ def test_projection_outside_a_ball_agrees_with_proxqp_along_the_radii(
 
 @quick
 @given(seed=seeds, alpha=alphas, alpha2=alphas, n=st.integers(3, 16), pinned=st.booleans())
-def test_from_near_the_centre_of_a_ball_a_high_order_chain_leads_out(
+def test_high_order_barrier_leads_out_of_a_ball_from_near_its_centre(
     seed, alpha, alpha2, n, pinned
 ):
     z = normal(seed, 2, n, 2, scale=0.2)
-    g = high(ball(1, centre=(0.0, 0.0), radius=0.7), alpha, alpha2)
+    g = high(ball("outside", centre=(0.0, 0.0), radius=0.7), alpha, alpha2)
     assert (
         float(g(project(g, z, pin(z, 0) if pinned else Pins.none(z))).max()) <= 1e-9
     )  # rounding of the solve
@@ -173,18 +174,18 @@ def test_from_near_the_centre_of_a_ball_a_high_order_chain_leads_out(
 
 @quick
 @given(seed=seeds, alpha=alphas, alpha2=alphas)
-def test_a_plan_that_begins_well_stays_safe(seed, alpha, alpha2):
+def test_plan_that_starts_with_positive_h_and_psi_stays_safe(seed, alpha, alpha2):
     """h >= 0 at the start and psi >= 0 there keep h >= 0 everywhere."""
     z = normal(seed, 2, 12, 2)
     z[:, 0], z[:, 1] = vec(1.5, 0.0), vec(1.45, 0.1)  # h = .8, then .75: psi >= 0 for alpha >= .07
-    g = high(ball(1, centre=(0.0, 0.0), radius=0.7), max(alpha, 0.07), alpha2)
+    g = high(ball("outside", centre=(0.0, 0.0), radius=0.7), max(alpha, 0.07), alpha2)
     x = project(g, z, pin(z, 0, 1))
     assert float(g(x).max()) <= 1e-9  # rounding of the solve
     assert float((0.7 - x.norm(dim=-1)).max()) <= 1e-9
 
 
 @pytest.mark.parametrize("alpha", [1e-3, 0.3, 1.0])
-def test_long_high_order_chains_are_found_too(alpha):
+def test_long_high_order_barriers_are_projected(alpha):
     z = normal(0, 2, 200, 1).cumsum(1)
     g = high(HalfSpace(vec(-1.0), num(0.0)), alpha, alpha)
     x = project(g, z, pin(z, 0))
@@ -193,13 +194,13 @@ def test_long_high_order_chains_are_found_too(alpha):
     torch.testing.assert_close(again, x, atol=1e-6, rtol=0)
 
 
-def test_its_jacobian_is_that_of_autograd():
-    g, x = high(ball(1), 0.3, 0.5), normal(0, 1, 7, 2)
+def test_jacobian_of_a_high_order_barrier_equals_autograd():
+    g, x = high(ball("outside"), 0.3, 0.5), normal(0, 1, 7, 2)
     J = jacobian(g.parts[0], x)[0].flatten(1)
     torch.testing.assert_close(J, torch.from_numpy(dense_jacobian(g, x)[0]), atol=1e-12, rtol=0)
 
 
-# look-ahead -----------------------------------------------------------------------------------------------------------
+# look-ahead ---------------------------------------------------------------------------------------
 
 BALL = {"kind": "quadratic", "side": "outside", "centre": {"x": 0.5, "y": 0.0}, "radius": 1.0}
 WALL = {"kind": "linear", "a": {"x": 2.0}, "b": 1.0}
@@ -211,7 +212,7 @@ def leading(barrier=BALL, lead=LEAD, **more):
     return Constraint((spec.compile(LAYOUT),))
 
 
-def test_the_rows_are_of_the_place_ahead_and_the_level_of_the_place_itself():
+def test_look_ahead_rows_use_the_place_ahead_and_state_values_the_place_itself():
     x = normal(0, 2, 5, 4)
     ahead = x.clone()
     ahead[..., :2] += 0.2 * x[..., 2:]
@@ -226,7 +227,7 @@ def test_the_rows_are_of_the_place_ahead_and_the_level_of_the_place_itself():
 
 @quick
 @given(seed=seeds, shared=st.booleans())
-def test_the_look_ahead_in_windows_of_many_scales_has_its_values_and_pulls(seed, shared):
+def test_look_ahead_in_a_frame_per_waypoint_keeps_values_and_pulls(seed, shared):
     scale = normal(seed + 1, 5, 2).abs() + 0.2
     scale = scale[:, [0, 0, 1, 1]] if shared else torch.cat((scale, scale.flip(0)), 1)
     centre, z = normal(seed + 2, 2, 5, 4), normal(seed, 2, 5, 4)
@@ -237,13 +238,15 @@ def test_the_look_ahead_in_windows_of_many_scales_has_its_values_and_pulls(seed,
         w, leaf = normal(seed + 3, *rows.shape), z.clone().requires_grad_()
         (expected,) = torch.autograd.grad(back(leaf), leaf, w)
         torch.testing.assert_close(pull(w), expected, atol=1e-9, rtol=1e-9)
-        assert has_exact_form(back.parts[0]) or not shared
+        assert projector_of(back.parts[0]) is not None or not shared
 
 
 @quick
 @given(seed=seeds)
-def test_the_look_ahead_is_projected_onto_by_place_and_velocity_together(seed):
-    """The nearest point has the normal's direction: a KKT residual of zero at every waypoint that moved."""
+def test_look_ahead_projection_moves_position_and_velocity_together(seed):
+    """The nearest point has the normal's direction: a KKT residual of zero at every waypoint that
+    moved.
+    """
     scale = (normal(seed + 1, 6, 2).abs() + 0.2)[:, [0, 0, 1, 1]]
     back, z = pull_back(leading(), normal(seed + 2, 2, 6, 4), scale), normal(seed, 2, 6, 4)
     x = project(back, z, pin(z, 0))
@@ -253,7 +256,7 @@ def test_the_look_ahead_is_projected_onto_by_place_and_velocity_together(seed):
     torch.testing.assert_close(moved, along, atol=1e-9, rtol=0)
 
 
-def test_segments_ask_for_the_barrier_of_the_place_itself():
+def test_look_ahead_on_segments_adds_the_state_set_of_the_place_itself():
     first, second = leading().parts[0].on_segments()
     assert isinstance(first, DiscreteBarrier)
     assert isinstance(second, OnSegments)
@@ -263,7 +266,7 @@ def test_segments_ask_for_the_barrier_of_the_place_itself():
     assert second.level is first.level
 
 
-def test_within_a_convex_set_the_place_follows_the_place_ahead():
+def test_place_stays_in_a_convex_set_when_the_place_ahead_does():
     """p' = p + dt v with dt <= time: a barrier that holds ahead holds for the place itself."""
     x = torch.zeros(1, 30, 4, dtype=F64)
     x[0, 0] = vec(-2.0, 0.0, 4.0, 0.0)
@@ -276,7 +279,7 @@ def test_within_a_convex_set_the_place_follows_the_place_ahead():
     assert float(g.parts[0].level(x).max()) <= 1e-12
 
 
-def test_an_observed_velocity_leads_the_obstacle_on_too():
+def test_look_ahead_moves_the_obstacle_with_its_observed_velocity():
     barrier = BALL | {"centre": {"x": "o.x", "y": "o.y"}}
     g = leading(barrier, velocity={"x": "o.vx", "y": "o.vy"})
     seen = {"o.x": vec(1.0), "o.y": vec(2.0), "o.vx": vec(3.0), "o.vy": vec(-1.0)}

@@ -37,7 +37,7 @@ def test_psi_of_known_states(state, psi):
     assert float(-barrier()(state)) == pytest.approx(psi)
 
 
-def test_a_moving_ball_is_met_in_relative_coordinates():
+def test_psi_of_a_moving_ball_uses_relative_coordinates():
     ball = barrier(centre=vec(1.0, 0.0), drift=vec(1.0, 0.0))
     assert float(-ball(vec(4.0, 0.0, 1.0, 0.0))) == pytest.approx(2.0)
     assert float(-ball(vec(4.0, 0.0, 0.0, 0.0))) == pytest.approx(1.5)
@@ -45,7 +45,7 @@ def test_a_moving_ball_is_met_in_relative_coordinates():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds)
-def test_the_gradient_is_autograds(seed):
+def test_gradient_of_psi_equals_autograd(seed):
     x = normal(seed, 3, 5, 4).requires_grad_()
     level = barrier(0.3, vec(0.4, -0.2), vec(1.0, 0.5))
     (found,) = torch.autograd.grad(level(x).sum(), x)
@@ -54,7 +54,7 @@ def test_the_gradient_is_autograds(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds)
-def test_pulled_back_it_takes_the_same_values(seed):
+def test_pulled_back_psi_keeps_its_values(seed):
     z, centre, scale = (
         normal(seed, 3, 5, 4),
         normal(seed + 1, 3, 5, 4),
@@ -66,8 +66,10 @@ def test_pulled_back_it_takes_the_same_values(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, time=st.floats(0.05, 1.0))
-def test_a_path_that_keeps_psi_never_enters(seed, time):
-    """dh/dt >= -h / time along a path in closed loop: radial speed -h / time, any speed across; h stays positive."""
+def test_path_with_non_negative_psi_never_enters_the_ball(seed, time):
+    """dh/dt >= -h / time along a path in closed loop: radial speed -h / time, any speed across; h
+    stays positive.
+    """
     x = normal(seed, 2)
     p, dt = (2.0 + float(x[0].abs())) * x / x.norm(), time / 500
     level = barrier(time)
@@ -79,6 +81,6 @@ def test_a_path_that_keeps_psi_never_enters(seed, time):
     assert float(p.norm()) > 1.0
 
 
-def test_shifted_it_keeps_further_away():
+def test_tightened_barrier_keeps_farther_away():
     x = normal(0, 7, 4)
     torch.testing.assert_close(barrier().tighten(0.2)(x), barrier()(x) + 0.2)

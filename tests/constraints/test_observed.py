@@ -1,4 +1,4 @@
-"""Constraints that observe: what YAML says of them, what they are bound to, and what each mistake is answered with."""
+"""Constraints with observed parameters: their YAML, binding, and the error for each mistake."""
 
 import pytest
 import torch
@@ -56,7 +56,7 @@ def states(seed):
     return normal(seed, 2, HORIZON, 4, scale=2.0)
 
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("form", ["distance", "squared"])
@@ -161,10 +161,10 @@ def test_executed_states_are_scored_each_against_its_own_time(tmp_path):
     torch.testing.assert_close(level(x), expected, atol=1e-12, rtol=0)
 
 
-# binding --------------------------------------------------------------------------------------------------------------
+# binding ------------------------------------------------------------------------------------------
 
 
-def test_what_observes_nothing_passes_through(tmp_path):
+def test_constraint_that_observes_nothing_binds_to_itself(tmp_path):
     _, g = load(tmp_path, "{name: fixed, kind: linear, a: {x: 1.0}, b: 0.5}", observable=())
     assert g.bind(SEEN, DT, HORIZON) is g
     _, g = load(
@@ -187,7 +187,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_what_is_asked_before_binding_is_done_after_it(case, seed, tmp_path_factory):
+def test_operations_before_binding_are_applied_after_it(case, seed, tmp_path_factory):
     kinds, g = load(tmp_path_factory.mktemp("own"), CASES[case])
     now = g.bind(SEEN, DT, HORIZON)
     centre, scale, x = (
@@ -208,7 +208,7 @@ def test_what_is_asked_before_binding_is_done_after_it(case, seed, tmp_path_fact
         )
 
 
-def test_a_margin_of_the_barrier_is_one_of_h_whatever_alpha(tmp_path):
+def test_tighten_level_tightens_h_whatever_alpha(tmp_path):
     """A calibrated margin: h >= 0.1 in place of h >= 0."""
     for entry in (CASES["barrier"], CASES["barrier"].replace("alpha: 0.3", "alpha: 0.3, order: 2")):
         _, g = load(tmp_path, entry)
@@ -242,7 +242,7 @@ def test_a_bound_barrier_is_projected_onto_in_a_window_relative_to_the_present(t
     assert float(back(x).max()) <= 2e-6  # float32
 
 
-def test_an_obstacle_that_is_inside_already_is_recovered_from(tmp_path):
+def test_bound_barrier_recovers_from_an_obstacle_that_already_overlaps(tmp_path):
     g = bound(tmp_path, CASES["barrier"])
     x = states(0)
     x[:, 0, :2] = torch.stack((SEEN["obstacle.x"], SEEN["obstacle.y"]), -1) + vec(0.2, 0.1)
@@ -254,7 +254,7 @@ def test_an_obstacle_that_is_inside_already_is_recovered_from(tmp_path):
     )  # after four waypoints .7^4 of it is left
 
 
-# mistakes -------------------------------------------------------------------------------------------------------------
+# mistakes -----------------------------------------------------------------------------------------
 
 MISTAKES = {
     "an unknown quantity": (
@@ -350,7 +350,7 @@ def test_a_constraint_that_waits_for_observations_has_no_values(tmp_path):
     require_bound(g.bind(SEEN, DT, HORIZON))
 
 
-# files ----------------------------------------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -376,14 +376,14 @@ def test_the_schema_lets_a_name_stand_for_a_number():
     }
 
 
-def test_what_moves_says_so(tmp_path):
+def test_description_of_a_moving_set_names_its_velocity(tmp_path):
     (kind,), _ = load(tmp_path, CASES["ball"])
     assert "centre" not in kind.describe()
     assert "x = obstacle.x, y = obstacle.y, radius 1" in kind.describe()
-    assert kind.describe().endswith("moving on at obstacle.vx x, obstacle.vy y a second")
+    assert kind.describe().endswith("moving on at obstacle.vx x, obstacle.vy y per second")
     (kind,), _ = load(tmp_path, CASES["ball"].replace("}}", "}, hold: true}"))
     assert kind.describe().endswith("held where it is observed")
 
 
-def test_a_chain_is_what_a_barrier_compiles_to(tmp_path):
+def test_dcbf_compiles_to_a_discrete_barrier(tmp_path):
     assert isinstance(bound(tmp_path, CASES["barrier"]).parts[0], DiscreteBarrier)

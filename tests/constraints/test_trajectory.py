@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.pins import Pins
+from cdiff_cli.constraints.protocol import segment_max
 from cdiff_cli.constraints.spec.kinds import Dcbf
 from cdiff_cli.constraints.spec.sets import Linear, Quadratic
-from cdiff_cli.constraints.state_sets import Quadric, segment_max
+from cdiff_cli.constraints.state_sets import Quadric
 from cdiff_cli.constraints.trajectory import Constraint, pull_back, stack
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
@@ -32,17 +33,17 @@ from tests.problems import (
 seeds = st.integers(0, 10_000)
 quick = settings(max_examples=30, deadline=None)
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 
 def test_ball_outside_is_radius_minus_distance():
-    g = waypoints(ball(1, centre=(0.0, 0.0), radius=2.0))
+    g = waypoints(ball("outside", centre=(0.0, 0.0), radius=2.0))
     x = vec(3.0, 4.0, 0.0, 1.0).reshape(1, 2, 2)
     torch.testing.assert_close(g(x), vec(-3.0, 1.0)[None])
 
 
 def test_ball_inside_is_distance_minus_radius():
-    g = waypoints(ball(-1, centre=(0.0, 0.0), radius=2.0))
+    g = waypoints(ball("inside", centre=(0.0, 0.0), radius=2.0))
     x = vec(3.0, 4.0, 0.0, 1.0).reshape(1, 2, 2)
     torch.testing.assert_close(g(x), vec(3.0, -1.0)[None])
 
@@ -90,7 +91,7 @@ def test_labels_name_the_part_and_its_waypoints():
 
 
 def test_stack_concatenates_rows_and_labels():
-    a, b = waypoints(half_space(), "a"), chain(ball(1), 0.5, "b")
+    a, b = waypoints(half_space(), "a"), chain(ball("outside"), 0.5, "b")
     both, x = stack([a, b]), normal(0, 3, 4, 2)
     assert torch.equal(both(x), torch.cat((a(x), b(x)), 1))
     assert both.labels(4) == a.labels(4) + b.labels(4)
@@ -113,7 +114,7 @@ def test_pins_paint_their_values_and_free_nothing_else():
 
 
 def test_a_segment_through_a_ball_is_unsafe_though_both_its_ends_are_safe():
-    part = AtWaypoints("b", ball(1, centre=(0.0, 0.0), radius=1.0))
+    part = AtWaypoints("b", ball("outside", centre=(0.0, 0.0), radius=1.0))
     x = vec(-3.0, 0.5, 3.0, 0.5).reshape(1, 2, 2)
     assert float(part(x).max()) < 0
     assert float(part.segment_max(x)) == pytest.approx(
@@ -123,10 +124,10 @@ def test_a_segment_through_a_ball_is_unsafe_though_both_its_ends_are_safe():
 
 def test_tightening_an_inside_ball_by_more_than_its_radius_is_infeasible():
     with pytest.raises(InfeasibleError, match="relax"):
-        waypoints(ball(-1, radius=0.7)).tighten(0.8)
+        waypoints(ball("inside", radius=0.7)).tighten(0.8)
 
 
-# gradients ------------------------------------------------------------------------------------------------------------
+# gradients ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -159,11 +160,12 @@ def test_row_sizes_bound_the_largest_eigenvalue_of_the_scaled_jacobian(kind, see
     J = torch.autograd.functional.jacobian(lambda v: g(v.reshape(x.shape))[0], x.flatten())
     scaled = J / size[0].clamp_min(1e-12).sqrt()[:, None]
     assert rows.shape == size.shape
-    # dual step 1 is stable below 2 / lambda_max; neighbouring rows of a chain differ in size, hence 2 rather than 1
+    # dual step 1 is stable below 2 / lambda_max; neighbouring rows of a chain differ in size,
+    # hence 2 rather than 1
     assert float(torch.linalg.eigvalsh(scaled @ scaled.T).max()) < 2.0
 
 
-# pull-back, tighten, segments -----------------------------------------------------------------------------------------
+# pull-back, tighten, segments ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
@@ -207,50 +209,54 @@ def test_segment_max_bounds_every_point_of_the_segment_and_is_attained(name, see
 
 @quick
 @given(seed=seeds, alpha=st.floats(0.01, 1.0))
-def test_a_chain_reports_its_barrier_along_segments(seed, alpha):
+def test_segment_max_of_a_barrier_is_minus_h(seed, alpha):
     x = normal(seed, 2, 4, 2)
     assert torch.equal(
-        DiscreteBarrier("c", ball(1), alpha).segment_max(x),
-        AtWaypoints("w", ball(1)).segment_max(x),
+        DiscreteBarrier("c", ball("outside"), alpha).segment_max(x),
+        AtWaypoints("w", ball("outside")).segment_max(x),
     )
 
 
 def test_to_moves_dtype_and_keeps_values():
-    g = waypoints(ball(1)).to(torch.zeros(1))
+    g = waypoints(ball("outside")).to(torch.zeros(1))
     assert g(torch.zeros(1, 1, 2)).dtype == torch.float32
     torch.testing.assert_close(
         g(torch.zeros(1, 1, 2)).double(),
-        waypoints(ball(1))(torch.zeros(1, 1, 2, dtype=F64)),
+        waypoints(ball("outside"))(torch.zeros(1, 1, 2, dtype=F64)),
         atol=1e-6,
         rtol=0,
     )
 
 
-def test_one_waypoint_has_a_segment_of_itself():
+def test_segment_max_of_a_single_waypoint_is_its_value():
     x = normal(0, 2, 1, 2)
     assert torch.equal(AtWaypoints("w", half_space()).segment_max(x), half_space()(x))
     assert torch.equal(DiscreteBarrier("c", half_space(), 0.5).segment_max(x), half_space()(x))
 
 
-# quadrics that are ellipsoids -----------------------------------------------------------------------------------------
+# quadrics that are ellipsoids ---------------------------------------------------------------------
 
 
-def test_a_quadric_knows_the_ellipsoid_whose_outside_it_is():
-    for level in (ball(1), ball(1, centre=(0.4, -1.0, 2.0), radius=0.3, dim=5), ellipsoid(1)):
+def test_quadric_is_converted_to_the_ellipsoid_whose_outside_it_is():
+    for level in (
+        ball("outside"),
+        ball("outside", centre=(0.4, -1.0, 2.0), radius=0.3, dim=5),
+        ellipsoid("outside"),
+    ):
         found = level.quadric().ball()
         for name in ("which", "centre", "axes", "m"):
             torch.testing.assert_close(
                 getattr(found, name), getattr(level, name), atol=1e-12, rtol=0
             )
-        assert found.side == 1
+        assert found.side == "outside"
 
 
 @pytest.mark.parametrize("name", ["inside ball squared", "general quadric"])
-def test_other_quadrics_are_no_ellipsoids_to_stay_outside_of(name):
+def test_quadric_that_is_no_outside_of_an_ellipsoid_is_not_converted(name):
     assert LEVELS[name].ball() is None
 
 
-def test_a_quadric_that_excludes_nothing_or_leans_on_a_further_coordinate_is_no_ellipsoid():
+def test_quadric_that_excludes_nothing_or_is_a_paraboloid_is_not_converted():
     P = torch.diag(vec(-1.0, 0.0))
     assert Quadric(P, vec(0.0, 0.0), num(1.0)).ball() is None  # -x^2 <= 1 always
     assert Quadric(P, vec(0.0, 1.0), num(-1.0)).ball() is None  # y <= x^2 - 1

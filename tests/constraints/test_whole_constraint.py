@@ -7,7 +7,7 @@ from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.trajectory import Constraint, stack
 from tests.problems import KINDS, ball, chain, half_space, normal, vec, waypoints
 
-UNIT_DISC = ball(1, centre=(0.0, 0.0), radius=1.0)
+UNIT_DISC = ball("outside", centre=(0.0, 0.0), radius=1.0)
 PAST = vec(-2.0, 0.5, 2.0, 0.5).reshape(1, 2, 2)  # a segment that passes 0.5 from the centre
 
 

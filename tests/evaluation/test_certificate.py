@@ -12,7 +12,7 @@ from cdiff_cli.evaluation.certificate import Saved, certificate, content_sha256,
 from tests.problems import ball, chain, num, opaque, vec, waypoints
 
 TASK = SimpleNamespace(name="plane", layout=("x", "y"), dt=0.5)
-DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "disc")
+DISC = waypoints(ball("outside", centre=(0.0, 0.0), radius=1.0), "disc")
 LEFT = waypoints(HalfSpace(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
 CUT = np.array(
     [[[-3.0, 0.6], [-2.0, 0.6], [2.0, 0.6], [3.0, 0.6]]]
@@ -136,7 +136,7 @@ def test_a_chain_is_judged_by_its_steps_and_between_waypoints_by_its_barrier():
 
 
 def test_a_chain_of_one_waypoint_has_no_steps_but_a_barrier():
-    (entry,) = certify(chain(ball(1, centre=(0.0, 0.0), radius=1.0), 0.5), [[[3.0, 0.0]]])[
+    (entry,) = certify(chain(ball("outside", centre=(0.0, 0.0), radius=1.0), 0.5), [[[3.0, 0.0]]])[
         "entries"
     ]
     assert entry["status"] == "safe"

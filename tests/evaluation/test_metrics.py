@@ -30,7 +30,7 @@ from cdiff_cli.planning.episodes import Episodes
 from tests.problems import ball, chain, num, vec, waypoints
 
 XY = (0, 1)
-DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "disc")
+DISC = waypoints(ball("outside", centre=(0.0, 0.0), radius=1.0), "disc")
 LEFT = waypoints(HalfSpace(vec(1.0, 0.0), num(1.0)), "left")  # x <= 1
 BOX = np.array([[0.0, 0.0, 1.0, 1.0]])
 

@@ -43,13 +43,16 @@ def test_bootstrap_interval_is_that_of_an_independent_implementation():
 
 
 def test_bootstrap_interval_covers_the_mean_of_skewed_draws():
-    """95 % asked for, 60 values a sample: 285 of 300 expected, standard deviation 4, and it falls a little short."""
+    """95 % intervals of 300 samples of 60 values: 285 expected to cover, standard deviation 4.
+
+    The bootstrap covers slightly less than it claims.
+    """
     rng = np.random.default_rng(0)
     bounds = [bootstrap(rng.exponential(size=60)) for _ in range(300)]
     assert 265 <= sum(low <= 1.0 <= high for low, high in bounds) <= 297
 
 
-def test_bootstrap_of_equal_values_is_their_value_and_of_one_there_is_none():
+def test_bootstrap_of_equal_values_is_that_value_and_of_one_value_none():
     assert bootstrap([2.0, 2.0, 2.0]) == (2.0, 2.0)
     assert bootstrap([2.0]) is None
 
@@ -58,7 +61,7 @@ def test_bootstrap_repeats_to_the_last_bit():
     assert bootstrap([1.0, 5.0, 2.0, 9.0]) == bootstrap([1.0, 5.0, 2.0, 9.0])
 
 
-def test_a_rate_gets_the_exact_interval_and_a_mean_the_bootstrap():
+def test_rate_gets_the_exact_interval_and_mean_the_bootstrap():
     values = [1.0, 0.0, 1.0, 1.0]
     assert interval(values, share=True) == clopper_pearson(3, 4)
     assert interval(values, share=False) == bootstrap(values)
@@ -96,7 +99,7 @@ def test_paired_tests_by_hand(d, test, share, p):
     assert paired_p(d, test, share) == pytest.approx(p, abs=1e-6)
 
 
-def test_one_pair_tests_nothing():
+def test_one_pair_has_no_p_value():
     assert math.isnan(paired_p([1.0], "wilcoxon", False))
 
 
@@ -108,7 +111,7 @@ def test_holm_by_hand():
     assert holm([]) == []
 
 
-def test_holm_leaves_out_what_was_not_tested():
+def test_holm_does_not_count_nan():
     corrected = holm([0.01, math.nan, 0.03])
     assert math.isnan(corrected[1])
     assert corrected[0] == pytest.approx(0.02)

@@ -1,7 +1,8 @@
-"""One code path for every device: what runs at a diffusion step, or once a plan, makes no tensor on a device that it does not name.
+"""Code that runs at every diffusion step or plan sets the device of every tensor.
 
-Without a GPU: the default device is one whose tensors hold nothing, so that a tensor made there cannot be used. What is made on the
-host on purpose and then kept, as the solvers' matrices, is made by a first call.
+The tests need no GPU: the default device is `meta`, whose tensors have no values, so that a tensor
+without a device cannot be used. Tensors that stay on the host on purpose, such as matrices of the
+solvers, are made by a first call.
 """
 
 from pathlib import Path
@@ -9,14 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.dynamics import split
 from cdiff_cli.constraints.observed import Observed
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.spec.load import load_constraints
 from cdiff_cli.constraints.trajectory import Constraint, pull_back
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.planning.problem import make_pins
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling import make_method
 from cdiff_cli.sampling.kernels import ddpm
@@ -35,7 +36,7 @@ def resolved(file, method):
 
 
 def twice(work):
-    """The same work, the second time with nothing behind the default device."""
+    """The same work, the second time with `meta` as the default device."""
     with torch.inference_mode():
         first = work()
         with torch.device("meta"):
@@ -47,22 +48,22 @@ def twice(work):
     "method", ["diffuser", "projected", "primal-dual", "alm", "safediffuser", "terminal"]
 )
 @pytest.mark.parametrize("file", FILES)
-def test_sampling_names_the_device_of_every_tensor(file, method):
+def test_sampling_sets_the_device_of_every_tensor(file, method):
     asked = resolved(file, method)
     problem = asked.problem
     g = pull_back(
         split(problem.enforced)[0], problem.normaliser.centre, problem.normaliser.scale
     ).to(torch.empty(0))
     pins, noise = (
-        make_pins(problem, 2, device=CPU),
-        normal(0, 5, 2, problem.horizon, 4, scale=0.5).float(),
+        problem.pins(2, device=CPU),
+        normal(0, 5, 2, problem.planner.horizon, 4, scale=0.5).float(),
     )
 
     def work():
         draws = iter(noise)
         return sample(
             lambda x, _: 0.9 * x,
-            problem.schedule,
+            problem.planner.schedule,
             asked.method,
             g,
             pins,
@@ -75,19 +76,19 @@ def test_sampling_names_the_device_of_every_tensor(file, method):
 
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("dynamics", [True, False])
-def test_the_last_projection_names_the_device_of_every_tensor(file, dynamics):
+def test_final_projection_sets_the_device_of_every_tensor(file, dynamics):
     problem = resolved(file, "alm").problem
     g = problem.enforced if dynamics else split(problem.enforced)[0]
     g = pull_back(g, problem.normaliser.centre, problem.normaliser.scale)
-    pins = make_pins(problem, 2, F64, CPU)
-    z = pins.paint(normal(1, 2, problem.horizon, 4, scale=0.3).cumsum(1) / 8)
+    pins = problem.pins(2, F64, CPU)
+    z = pins.paint(normal(1, 2, problem.planner.horizon, 4, scale=0.3).cumsum(1) / 8)
     twice(lambda: project(g, z, pins, strict=False))
 
 
 @pytest.mark.parametrize("method", ["projected", "primal-dual", "alm"])
 @pytest.mark.parametrize("task", ["hopper", "swimmer", "ball-run"])
-def test_plans_of_control_name_the_device_of_every_tensor(task, method):
-    """Barrier chains over a short window, the obstacle of the ball run where it was observed."""
+def test_receding_horizon_plans_set_the_device_of_every_tensor(task, method):
+    """Discrete barriers over a short window, bound to the observed obstacle of the ball run."""
     made = load_task(task)
     observable = tuple(getattr(made, "observable", ()))
     _, g = load_constraints(

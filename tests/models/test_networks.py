@@ -1,4 +1,4 @@
-"""The U-Net: shapes, and the pinned ends that must come back untouched."""
+"""The U-Net: shapes, and pinned ends that stay as they are."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def test_step_embedding_of_zero_is_sines_0_and_cosines_1():
     assert SinusoidalStep(8)(torch.zeros(1)).tolist() == [[0, 0, 0, 0, 1, 1, 1, 1]]
 
 
-def test_step_embedding_begins_with_the_plain_angle():
+def test_step_embedding_starts_with_the_plain_angle():
     t = torch.tensor([1.0, 2.0])
     embedded = SinusoidalStep(8)(t)
     assert torch.allclose(embedded[:, 0], t.sin())
@@ -75,7 +75,7 @@ def test_only_the_named_ends_are_pinned(ends):
     assert torch.equal(estimate[:, -1], x[:, -1]) == (-1 in ends)
 
 
-def test_share_of_the_pinned_state_falls_evenly_to_zero_within_the_ramp(net):
+def test_share_of_the_pinned_state_falls_linearly_to_zero_within_the_ramp(net):
     share = net._share(0, noise(0, 1, 128, 4))[:, 0]
     assert torch.allclose(share[:17], 1 - torch.arange(17) / 16)
     assert share[17:].abs().max() == 0
@@ -87,14 +87,14 @@ def test_ramps_of_a_short_horizon_do_not_overlap(net):
     assert (net._share(0, x) * net._share(-1, x)).abs().max() == 0
 
 
-def test_a_pinned_state_is_seen_by_every_waypoint(net):
+def test_every_waypoint_depends_on_the_pinned_state(net):
     x = noise(2, 1, 128, 4)
     moved = x.clone()
     moved[:, -1] += 1.0
     assert (net(x, torch.ones(1)) != net(moved, torch.ones(1))).any(-1)[0, 1:].all()
 
 
-def test_estimates_of_a_batch_do_not_mix(net):
+def test_trajectories_of_a_batch_do_not_affect_each_other(net):
     x, t = noise(3, 3, 32, 4), torch.tensor([1.0, 9.0, 40.0])
     alone = torch.cat([net(x[i : i + 1], t[i : i + 1]) for i in range(3)])
     assert torch.allclose(net(x, t), alone, atol=1e-5)  # float32, sums in another order

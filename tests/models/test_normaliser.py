@@ -6,6 +6,7 @@ import torch
 
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.networks import ResidualMlp
+from cdiff_cli.models.normaliser import Normaliser
 from cdiff_cli.models.recipe import InverseSpec
 from cdiff_cli.training.inverse_dynamics import fit_inverse
 from cdiff_cli.training.windows import Windows, fit_residual_normaliser
@@ -33,22 +34,22 @@ def windows(n: int = 50) -> torch.Tensor:
     return WINDOWS[torch.arange(0, len(WINDOWS.starts), len(WINDOWS.starts) // n)]
 
 
-def test_a_window_comes_back_from_its_frame():
+def test_residual_normaliser_decodes_what_it_encodes():
     x = windows()
     torch.testing.assert_close(FRAME.at(x[:, 0]).decode(FRAME.encode(x)), x)
 
 
-def test_every_waypoint_has_its_own_scale_of_one():
+def test_encoded_windows_have_standard_deviation_one_at_every_waypoint():
     z = FRAME.encode(WINDOWS[torch.arange(len(WINDOWS.starts))])[:, 1:]
     torch.testing.assert_close(z.mean(0), torch.zeros(7, 3, dtype=F64), atol=1e-9, rtol=0)
     torch.testing.assert_close(z.std(0)[:, 2], torch.ones(7, dtype=F64))
     torch.testing.assert_close(
         z.std(0)[:, :2].amax(1), torch.ones(7, dtype=F64)
-    )  # x and y share theirs: the wider has one
+    )  # x and y share a scale, that of the wider one
 
 
-def test_what_follows_from_the_present_state_alone_is_in_the_frame():
-    """Windows of a linear system without inputs: nothing is left to guess."""
+def test_window_that_follows_from_its_first_state_encodes_to_zero():
+    """Windows of a linear system without inputs have no residual."""
     start = normal(3, 40, 3)
     x = [start]
     for _ in range(7):
@@ -60,14 +61,14 @@ def test_what_follows_from_the_present_state_alone_is_in_the_frame():
     torch.testing.assert_close(some.at(every[30:, 0]).centre[:, 1:], every[30:, 1:])
 
 
-def test_a_window_moved_along_an_invariant_coordinate_looks_the_same():
+def test_shift_along_an_invariant_coordinate_does_not_change_the_encoding():
     x = windows()
     torch.testing.assert_close(FRAME.encode(x + torch.tensor([7.0, 0.0, 0.0])), FRAME.encode(x))
     assert bool((FRAME.encode(x)[:, 0, 0] == 0).all())
     assert not torch.allclose(FRAME.encode(x + torch.tensor([0.0, 7.0, 0.0])), FRAME.encode(x))
 
 
-def test_the_residual_network_hands_the_present_state_back():
+def test_residual_network_returns_the_present_state():
     x = normal(0, 5, 8, 3).float()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -78,30 +79,59 @@ def test_the_residual_network_hands_the_present_state_back():
 
 @pytest.fixture(scope="module")
 def fitted():
-    """Forty long episodes and twenty short ones of the linear system, its inverse dynamics fitted."""
+    """Inverse dynamics fitted to 40 long and 20 short episodes of the linear system."""
     pairs = [episode(seed, 100 if seed < 40 else 5) for seed in range(60)]
     spec = InverseSpec(width=64, steps=400, batch=256, learning_rate=3e-3)
     episodes, inputs = zip(*pairs, strict=True)
     return fit_inverse(episodes, inputs, 16, spec, 0)
 
 
-def test_the_inverse_dynamics_of_a_linear_system_are_found(fitted):
+def test_inverse_dynamics_of_a_linear_system_are_recovered(fitted):
     assert fitted[1]["windows"] > 0.98
     assert fitted[1]["branches"] > 0.9
 
 
-def test_inputs_stay_within_those_of_the_data(fitted):
+def test_predicted_inputs_are_within_the_bounds_of_the_data(fitted):
     u = fitted[0](normal(0, 100, 3).float(), 50 * normal(1, 100, 3).float())
     assert float(u.abs().max()) <= 1.0
     assert float(u.abs().max()) > 0.9
 
 
-def test_without_inputs_there_is_no_inverse_dynamics_model():
+def test_inverse_dynamics_without_inputs_are_an_error():
     with pytest.raises(CdiffError, match="no inputs"):
         fit_inverse([episode(0, 100)[0]], [], 16, InverseSpec(), 0)
 
 
-def test_a_single_episode_is_fitted_to_and_none_is_held_out():
+def test_single_episode_is_trained_on_and_none_is_held_out():
     x, u = episode(0, 40)
     _, explained = fit_inverse([x], [u], 16, InverseSpec(width=4, steps=1, batch=8), 0)
     assert explained == {}
+
+
+def test_limits_go_to_minus_one_and_one():
+    to = Normaliser.from_limits([-1.0, 0.0], (3.0, 10.0))
+    assert to.encode(torch.tensor([[-1.0, 0.0], [3.0, 10.0], [1.0, 5.0]], dtype=F64)).tolist() == [
+        [-1.0, -1.0],
+        [1.0, 1.0],
+        [0.0, 0.0],
+    ]
+    x = normal(0, 5, 2)
+    torch.testing.assert_close(to.decode(to.encode(x)), x)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([0.0, 1.0], [1.0, 1.0]),
+        ([0.0, 2.0], [1.0, 1.0]),
+        ([0.0], [1.0, 1.0]),
+        ([[0.0]], [[1.0]]),
+        (0.0, 1.0),
+        ([0.0, np.nan], [1.0, 1.0]),
+        ([-np.inf], [np.inf]),
+    ],
+    ids=str,
+)
+def test_limits_without_width_are_refused(low, high):
+    with pytest.raises(ValueError, match="expected low < high for every coordinate"):
+        Normaliser.from_limits(low, high)

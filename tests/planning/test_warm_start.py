@@ -1,4 +1,6 @@
-"""Multipliers carried from one plan to the next: each lands on the row that it belonged to, moved on by the steps executed."""
+"""Multipliers carried from one plan to the next: each lands on the row that it belonged to, moved
+on by the steps executed.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from tests.problems import F64, ball, half_space, normal
 
 H = 5
 G = Constraint(
-    (OnSegments("ball", ball(1)), AtWaypoints("wall", half_space()))
+    (OnSegments("ball", ball("outside")), AtWaypoints("wall", half_space()))
 )  # 4 segments, 5 waypoints
 NOISY = {"expected": [101, 102, 103, 0, *(105, 106, 107, 108, 0)], "n": 9}  # in the order of g
 PLANES = {
@@ -80,7 +82,9 @@ def test_selected_plans_keep_their_own_multipliers_and_shared_ones_are_kept_whol
 @pytest.mark.parametrize("name", ["primal-dual", "alm"])
 @pytest.mark.parametrize("on", ["noisy", "clean"])
 def test_a_carried_multiplier_pushes_the_waypoints_that_it_pushed_before(name, on):
-    """The wall's multiplier of waypoint 3 alone: a step later waypoint 2 alone is pushed, and along the wall's normal."""
+    """The wall's multiplier of waypoint 3 alone: a step later waypoint 2 alone is pushed, and along
+    the wall's normal.
+    """
     x = normal(0, 1, H, 2) * 0.1 + torch.tensor(
         [0.3, 3.0], dtype=F64
     )  # far from the ball, within the wall

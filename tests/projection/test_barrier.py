@@ -1,4 +1,4 @@
-"""The nearest chain v_{k+1} >= gamma v_k: known answers, agreement with a QP solver, multipliers, powers that underflow."""
+"""The nearest values with v_{k+1} >= gamma v_k: known answers, a QP solver, multipliers, underflow."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from cdiff_cli.projection.project import project
 from cdiff_cli.projection.solvers.isotonic import pool_violators
 from tests.problems import F64, chain, nearest_chain, normal, num, pin, qp_project, vec
 
-QP = 1e-6  # ProxQP's own accuracy is about 1e-9 a constraint; many coupled ones with alpha = 1e-3 cost digits
+QP = 1e-6  # accuracy of ProxQP: 1e-9 per constraint, less for many coupled ones
 
 
 def _fixed(n, *ends):
@@ -60,7 +60,7 @@ def _fixed(n, *ends):
         (0.5, (4.0, 2.0, 1.0), (1.0, 1.0, 1.0), (), (4.0, 2.0, 1.0)),
     ],
 )
-def test_nearest_chain_by_hand(gamma, h, weight, ends, v):
+def test_nearest_barrier_values_match_hand_calculation(gamma, h, weight, ends, v):
     found = nearest_chain(vec(*h)[None], gamma, vec(*weight), _fixed(len(h), *ends))
     torch.testing.assert_close(found[0], vec(*v), atol=1e-15, rtol=1e-15)  # rounding
 
@@ -72,7 +72,7 @@ def test_nearest_chain_by_hand(gamma, h, weight, ends, v):
     alpha=st.floats(1e-3, 1.0),
     ends=st.sets(st.sampled_from([0, -1])),
 )
-def test_weighted_nearest_chain_agrees_with_proxqp(seed, n, alpha, ends):
+def test_weighted_nearest_barrier_values_agree_with_proxqp(seed, n, alpha, ends):
     h, w, fixed = normal(seed, 2, n), normal(seed + 1, n).abs() + 0.2, _fixed(n, *ends)
     h[:, 0], h[:, -1] = 0.5, 1.0  # a chain between these two is always possible
     v = nearest_chain(h, 1 - alpha, w, fixed)
@@ -91,8 +91,10 @@ def test_weighted_nearest_chain_agrees_with_proxqp(seed, n, alpha, ends):
 @pytest.mark.parametrize("alpha", [1e-3, 0.05, 0.85, 1.0])
 @pytest.mark.parametrize("n", [384, 1536])
 @pytest.mark.parametrize("start", ["free", "start fixed"])
-def test_long_nearest_chains_are_optimal_and_idempotent(n, alpha, start):
-    """Stationarity  w_k (v_k - h_k) + gamma lam_k - lam_{k-1} = 0,  lam >= 0 only where v_{k+1} = gamma v_k."""
+def test_nearest_values_of_long_barriers_are_optimal_and_idempotent(n, alpha, start):
+    """Stationarity  w_k (v_k - h_k) + gamma lam_k - lam_{k-1} = 0,  lam >= 0 only where v_{k+1} =
+    gamma v_k.
+    """
     gamma, w, fixed = (
         1 - alpha,
         normal(n, n).abs() + 0.2,
@@ -116,7 +118,9 @@ def test_long_nearest_chains_are_optimal_and_idempotent(n, alpha, start):
 
 
 def _pooled_one_by_one(h, gamma, w):
-    """The stack of pooled adjacent violators, one index after the other: (N, D, length) of each block."""
+    """The stack of pooled adjacent violators, one index after the other: (N, D, length) of each
+    block.
+    """
     blocks = []
     for value, weight in zip(h.tolist(), w.tolist(), strict=True):
         blocks.append((weight * value, weight, 1))
@@ -164,7 +168,7 @@ KINDS = {
     alpha=st.sampled_from([1e-3, 0.05, 0.5, 0.85, 1.0]),
     spread=st.sampled_from([0.0, 1.0, 3.0]),
 )
-def test_rounds_of_wide_merges_end_where_merging_one_by_one_does(kinds, seed, n, alpha, spread):
+def test_merging_in_windows_equals_merging_one_by_one(kinds, seed, n, alpha, spread):
     h = torch.stack([KINDS[kind](seed + at, n) for at, kind in enumerate(kinds)])
     w = (spread * normal(seed, len(kinds), n)).exp()
     v, _ = pool_violators(h, 1 - alpha, w)
@@ -176,9 +180,10 @@ def test_rounds_of_wide_merges_end_where_merging_one_by_one_does(kinds, seed, n,
     )  # rounding of a sum of n terms
 
 
-def test_a_block_that_outweighs_all_between_takes_in_none_of_it():
-    """With the first 60 values in one block, what follows changes the value pooled with it by less than rounding: a test on that
-    value could not tell that the block stays out.
+def test_block_with_a_large_weight_takes_in_no_neighbour_that_does_not_fall():
+    """The first 60 values are one block, whose weight hides what is pooled with it.
+
+    The pooled value changes by less than rounding, so the test looks at the block itself.
     """
     h = torch.linspace(0, 1, 120, dtype=F64).repeat(8, 1)
     h[:, :60] = -torch.linspace(1, 3, 8, dtype=F64)[:, None]
@@ -193,7 +198,7 @@ def test_a_block_that_outweighs_all_between_takes_in_none_of_it():
 @pytest.mark.parametrize(
     ("alpha", "rounds"), [(0.05, 1), (1e-3, 20)]
 )  # one neighbour a round would take 96 to 383
-def test_a_lone_value_takes_in_a_whole_rise_in_few_rounds(end, value, alpha, rounds):
+def test_single_value_takes_in_a_whole_rise_in_few_rounds(end, value, alpha, rounds):
     h = torch.linspace(0, 1, 384, dtype=F64).repeat(10, 1)
     h[:, end] = value
     assert pool_violators(h, 1 - alpha, torch.ones_like(h[0]))[1] <= rounds
@@ -203,7 +208,7 @@ def test_a_lone_value_takes_in_a_whole_rise_in_few_rounds(end, value, alpha, rou
 @pytest.mark.parametrize("alpha", [1e-3, 0.05, 0.85, 1.0])
 @pytest.mark.parametrize("n", [384, 1536])
 @pytest.mark.parametrize("end", [0.0, 2.0])
-def test_no_power_of_gamma_spoils_a_long_chain_between_two_ends(dtype, alpha, n, end):
+def test_underflowing_powers_of_gamma_do_not_affect_long_barriers(dtype, alpha, n, end):
     h = normal(3, 2, n, scale=0.5).to(dtype)
     h[:, 0], h[:, -1] = 0.0, end
     v = nearest_chain(h, 1 - alpha, torch.ones_like(h[0]), _fixed(n, 0, -1))
@@ -215,14 +220,14 @@ def test_no_power_of_gamma_spoils_a_long_chain_between_two_ends(dtype, alpha, n,
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_an_end_below_zero_out_of_reach_is_refused(dtype):
+def test_pinned_end_below_zero_that_cannot_be_reached_is_refused(dtype):
     z = torch.ones(1, 384, 1, dtype=dtype)
     z[0, -1] = -1.0  # h = x: the start would have to lie below -0.15^-383
     with pytest.raises(InfeasibleError):
         project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.85).to(z), z, pin(z, -1))
 
 
-def test_one_block_may_reach_further_than_gamma_has_powers():
+def test_one_block_may_be_longer_than_the_representable_powers_of_gamma():
     h = torch.full((1, 2000), -1.0, dtype=F64)
     h[0, 0] = 3.0
     v = nearest_chain(h, 0.5, torch.ones_like(h[0]), _fixed(2000))
@@ -233,7 +238,7 @@ def test_one_block_may_reach_further_than_gamma_has_powers():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_nearest_chain_of_a_batch_is_that_of_each_plan(dtype):
+def test_nearest_barrier_values_of_a_batch_equal_those_of_each_plan(dtype):
     line = torch.arange(50.0).to(F64)
     h, w = (
         torch.stack((normal(1, 50), normal(2, 50).cumsum(0), line, -line)).to(dtype),
@@ -246,7 +251,7 @@ def test_nearest_chain_of_a_batch_is_that_of_each_plan(dtype):
     assert nearest_chain(h[:0], 0.9, w, _fixed(50)).shape == (0, 50)
 
 
-def test_float32_is_the_rounded_float64():
+def test_float32_result_is_the_rounded_float64_result():
     h, w = normal(4, 3, 200).cumsum(1).float(), normal(5, 200).abs().float() + 0.2
     exact = nearest_chain(h.double(), 0.95, w.double(), _fixed(200))
     assert torch.equal(nearest_chain(h, 0.95, w, _fixed(200)), exact.float())

@@ -1,4 +1,6 @@
-"""Linear dynamics: fitting them, their rows by hand, and the nearest reachable trajectory against a QP solver."""
+"""Linear dynamics: fitting them, their rows by hand, and the nearest reachable trajectory against a
+QP solver.
+"""
 
 from dataclasses import replace
 
@@ -66,7 +68,9 @@ def reachable(dynamics, tolerance=1e-5, weight=None):
 
 
 def noisy_path(dynamics, seed, batch, horizon, noise=0.02):
-    """A trajectory under random inputs and, beside it, itself with noise on all states but the first."""
+    """A trajectory under random inputs and, beside it, itself with noise on all states but the
+    first.
+    """
     u = torch.clamp(normal(seed, batch, horizon - 1, 2, scale=0.8), -1, 1)
     path = dynamics.rollout(normal(seed + 1, batch, 4) * vec(0.5, 0.5, 2, 2), u)
     z = path + noise * normal(seed + 2, batch, horizon, 4) * vec(1, 1, 15, 15)
@@ -74,14 +78,14 @@ def noisy_path(dynamics, seed, batch, horizon, noise=0.02):
     return path, z
 
 
-def solve(dynamics, z, pins, parts=(), rounds=3000, used=(0, 1), **more):
+def solve(dynamics, z, pins, parts=(), rounds=3000, columns=(0, 1), **more):
     settings = {
-        "used": used if parts or more.get("rest") else (),
+        "columns": columns if parts or more.get("others") else (),
         "weight": WEIGHT,
         "rounds": rounds,
         "tolerance": 1e-9,
     }
-    return project_dynamics(dynamics, parts, more.pop("rest", None), z, pins, **(settings | more))
+    return project_dynamics(dynamics, parts, more.pop("others", None), z, pins, **(settings | more))
 
 
 def distance(x, z):
@@ -89,7 +93,9 @@ def distance(x, z):
 
 
 def qp(dynamics, z, pinned, a=None, b=0.0):
-    """The same by ProxQP over all states and inputs at once: a.x <= b at every waypoint that is not pinned."""
+    """The same by ProxQP over all states and inputs at once: a.x <= b at every waypoint that is not
+    pinned.
+    """
     (H, n), m = z.shape, dynamics.B.shape[1]
     N, M = H * n, (H - 1) * m
     w = np.tile(WEIGHT.numpy(), H)
@@ -132,7 +138,7 @@ def qp(dynamics, z, pinned, a=None, b=0.0):
     return torch.from_numpy(x[:N].reshape(H, n))
 
 
-# by hand --------------------------------------------------------------------------------------------------------------
+# by hand ------------------------------------------------------------------------------------------
 
 
 def test_rollout_of_a_double_integrator_by_hand():
@@ -145,14 +151,16 @@ def test_rollout_of_a_double_integrator_by_hand():
 def test_inputs_of_a_path_are_those_that_made_it_and_are_cut_to_their_bounds():
     d, u = double_integrator(), torch.tensor([[[0.5], [-3.0], [1.0]]], dtype=F64)
     x = d.rollout(vec(0.0, 1.0)[None], u)
-    torch.testing.assert_close(d.wanted(x), u, atol=1e-12, rtol=0)
+    torch.testing.assert_close(d.unbounded_inputs(x), u, atol=1e-12, rtol=0)
     torch.testing.assert_close(
         d.inputs(x), torch.tensor([[[0.5], [-1.0], [1.0]]], dtype=F64), atol=1e-12, rtol=0
     )
 
 
 def test_residual_by_hand():
-    """u = -3 is cut to -1: the step misses by 2 (1/2, 1). A step sideways to B = (1/2, 1) is missed whole."""
+    """u = -3 is cut to -1: the step misses by 2 (1/2, 1). A step sideways to B = (1/2, 1) is missed
+    whole.
+    """
     d = double_integrator()
     x = d.rollout(vec(0.0, 1.0)[None], torch.tensor([[[0.5], [-3.0]]], dtype=F64))
     torch.testing.assert_close(d.residual(x), vec(0.0, 2 * 1.25**0.5)[None], atol=1e-12, rtol=0)
@@ -160,7 +168,7 @@ def test_residual_by_hand():
     torch.testing.assert_close(d.residual(x), vec(1.25**0.5)[None], atol=1e-12, rtol=0)
 
 
-def test_rows_of_reachable_are_one_a_step_and_count_from_the_tolerance():
+def test_dynamics_have_one_row_per_step_minus_the_tolerance():
     part = reachable(double_integrator(), tolerance=0.25)
     x = torch.stack((vec(0.0, 0.0), vec(1.0, -0.5), vec(0.5, -0.5)))[None]
     torch.testing.assert_close(part(x), vec(1.25**0.5 - 0.25, -0.25)[None], atol=1e-12, rtol=0)
@@ -172,7 +180,7 @@ def test_rows_of_reachable_are_one_a_step_and_count_from_the_tolerance():
 
 @settings(max_examples=20, deadline=None)
 @given(seed=seeds)
-def test_pulled_back_reachable_keeps_its_rows(seed):
+def test_pulled_back_dynamics_keep_their_rows(seed):
     part, centre, scale = reachable(maze()), normal(seed + 1, 4), normal(seed + 2, 4).abs() + 0.1
     z = normal(seed, 2, 5, 4)
     torch.testing.assert_close(
@@ -186,7 +194,7 @@ def test_pulled_back_reachable_keeps_its_rows(seed):
 
 @settings(max_examples=20, deadline=None)
 @given(seed=seeds, size=st.sampled_from([0.05, 1.0]))  # within and beyond what the inputs reach
-def test_the_written_gradient_of_reachable_is_that_of_autograd(seed, size):
+def test_pull_of_dynamics_equals_autograd(seed, size):
     part = reachable(maze()).pull_back(normal(seed, 4), normal(seed + 1, 4).abs() + 0.5)
     _, x = noisy_path(maze(), seed, 2, 5, noise=size)
     x = part.encode(x)
@@ -204,7 +212,7 @@ def test_the_written_gradient_of_reachable_is_that_of_autograd(seed, size):
         assert bool((alone.square().sum((1, 2)) <= bound[:, k] + 1e-12).all())
 
 
-# fitting --------------------------------------------------------------------------------------------------------------
+# fitting ------------------------------------------------------------------------------------------
 
 
 def transitions(seed, k):
@@ -227,7 +235,7 @@ def test_fit_recovers_the_dynamics_though_one_step_in_twenty_is_a_collision(corr
     assert share == pytest.approx(1 - corrupted, abs=1e-12)
 
 
-def test_a_poor_fit_shows_in_the_share():
+def test_poor_fit_has_a_small_share_of_linear_steps():
     _, (x, u, after) = transitions(0, 2000)
     assert fit(x, u, after + 0.3 * np.sin(5 * x))[1] < 0.01
 
@@ -242,13 +250,15 @@ def test_a_coordinate_that_never_moves_is_fitted():
     np.testing.assert_allclose(found(torch.from_numpy(x), torch.from_numpy(u)), after, atol=1e-9)
 
 
-# the nearest reachable trajectory -------------------------------------------------------------------------------------
+# the nearest reachable trajectory -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("horizon", [2, 8, 24])
-def test_without_bounds_it_is_the_least_squares_solution(horizon, ends):
-    """x = F x0 + G u with the first state given: min |W^(1/2) (G u - r)|^2, s.t. the last state where pinned, by its KKT system."""
+def test_projection_without_bounds_is_the_least_squares_solution(horizon, ends):
+    """x = F x0 + G u with the first state given: min |W^(1/2) (G u - r)|^2, s.t. the last state
+    where pinned, by its KKT system.
+    """
     d = replace(maze(bound=1e6), c=vec(0.01, 0.0, 0.02, -0.01))
     path, z = noisy_path(d, horizon, 1, horizon)
     ends = ends and horizon > 2  # one step reaches no state of four coordinates exactly
@@ -275,7 +285,9 @@ def test_without_bounds_it_is_the_least_squares_solution(horizon, ends):
 @pytest.mark.parametrize("wall", [False, True])
 @pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize("horizon", [8, 24])
-def test_with_tight_bounds_and_a_half_space_it_is_the_solution_of_proxqp(horizon, ends, wall, seed):
+def test_projection_with_tight_bounds_and_a_half_space_agrees_with_proxqp(
+    horizon, ends, wall, seed
+):
     d, a = maze(), vec(1.0, -1.0, 0.0, 0.0)
     path, z = noisy_path(d, seed, 1, horizon)
     pinned = [0, horizon - 1] if ends else [0]
@@ -297,18 +309,22 @@ def test_with_tight_bounds_and_a_half_space_it_is_the_solution_of_proxqp(horizon
 
 
 @pytest.mark.parametrize("rounds", [1, 3, 50])
-def test_every_iterate_obeys_the_dynamics(rounds):
+def test_every_iterate_satisfies_the_dynamics(rounds):
     d = maze()
     _, z = noisy_path(d, 0, 3, 16)
     x, warm = solve(
-        d, z, pin(z, 0), [OnSegments("s", ball(1, centre=(0.1, 0.0), radius=0.2))], rounds=rounds
+        d,
+        z,
+        pin(z, 0),
+        [OnSegments("s", ball("outside", centre=(0.1, 0.0), radius=0.2))],
+        rounds=rounds,
     )
     torch.testing.assert_close(
         x, d.rollout(z[:, 0], warm.u), atol=1e-12, rtol=0
     )  # rounding of matrix powers
 
 
-def test_a_batch_is_solved_as_each_alone():
+def test_projection_of_a_batch_equals_that_of_each_plan():
     d, part = maze(), AtWaypoints("w", HalfSpace(vec(1.0, 0.5), num(0.3)))
     _, z = noisy_path(d, 5, 4, 12)
     z[:, 0, :2] -= 0.6
@@ -319,7 +335,7 @@ def test_a_batch_is_solved_as_each_alone():
     torch.testing.assert_close(whole, alone, atol=1e-12, rtol=0)
 
 
-def test_going_on_from_where_it_stopped_reaches_the_same_point():
+def test_warm_start_reaches_the_same_point():
     d, part = maze(), AtWaypoints("w", HalfSpace(vec(1.0, 0.5), num(0.0)))
     _, z = noisy_path(d, 6, 2, 16)
     z[:, 0, :2] = -0.05
@@ -335,17 +351,19 @@ def test_going_on_from_where_it_stopped_reaches_the_same_point():
 
 @pytest.mark.parametrize("batch", [0, 2])
 @pytest.mark.parametrize("horizon", [1, 2])
-def test_short_horizons_and_empty_batches_pass(batch, horizon):
-    g = Constraint((reachable(maze()), OnSegments("s", ball(1, dim=4))))
+def test_short_horizons_and_empty_batches_are_returned(batch, horizon):
+    g = Constraint((reachable(maze()), OnSegments("s", ball("outside", dim=4))))
     z = normal(0, batch, horizon, 4) + 3.0
     assert project(g, z, pin(z, 0)).shape == z.shape
 
 
-# projection -----------------------------------------------------------------------------------------------------------
+# projection ---------------------------------------------------------------------------------------
 
 
 def trip(horizon=64, length=0.8):
-    """A reachable trip along y = .05 at constant acceleration, then deceleration, from rest to rest."""
+    """A reachable trip along y = .05 at constant acceleration, then deceleration, from rest to
+    rest.
+    """
     half = (horizon - 1) // 2
     u = torch.zeros(1, horizon - 1, 2, dtype=F64)
     u[0, :half, 0], u[0, half : 2 * half, 0] = 1.0, -1.0
@@ -355,9 +373,9 @@ def trip(horizon=64, length=0.8):
 
 
 @pytest.mark.parametrize("dtype", [F64, torch.float32])
-def test_a_disc_on_the_way_is_avoided_on_segments_within_the_inputs(dtype):
+def test_segments_avoid_a_disc_within_the_input_bounds(dtype):
     z = trip()
-    disc = OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4))
+    disc = OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4))
     assert float(disc(z).max()) > 0.05
     g = Constraint((reachable(maze(), weight=WEIGHT), disc)).to(z.to(dtype))
     z = z.to(dtype)
@@ -372,12 +390,12 @@ def test_a_disc_on_the_way_is_avoided_on_segments_within_the_inputs(dtype):
     assert float(g.parts[0](x).max()) <= 1e-4
 
 
-def test_a_pulled_back_projection_is_the_pulled_back_result():
+def test_projection_of_pulled_back_dynamics_is_the_pulled_back_projection():
     z, centre, scale = trip(), vec(0.3, -0.2, 0.1, 0.0), vec(1.3, 1.3, 4.0, 4.0)
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     x = project(g, z, pin(z, 0, 63))
@@ -388,18 +406,18 @@ def test_a_pulled_back_projection_is_the_pulled_back_result():
     )
 
 
-def test_a_trajectory_that_obeys_all_stays():
+def test_trajectory_that_satisfies_everything_is_unchanged():
     z = trip()
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 1.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 1.0), radius=0.12, dim=4)),
         )
     )
     torch.testing.assert_close(project(g, z, pin(z, 0, 63)), z, atol=1e-6, rtol=0)
 
 
-def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
+def test_unreachable_goal_is_missed_without_an_error():
     """64 steps of full force go 4.2 m; asked are 20."""
     z = trip()
     z[:, -1, 0] = 20.0
@@ -416,7 +434,7 @@ def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
     "other",
     [
         DiscreteBarrier("c", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.0)), 0.3),
-        AtWaypoints("q", ball(-1, centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
+        AtWaypoints("q", ball("inside", centre=(-0.1, 0.0), radius=0.41, dim=4).quadric()),
         AtWaypoints(
             "s",
             replace(
@@ -426,7 +444,7 @@ def test_a_goal_out_of_reach_is_missed_visibly_and_does_not_crash():
     ],
     ids=["chain over a half-space", "inside a quadric", "saddle"],
 )
-def test_chains_and_quadrics_beside_dynamics_are_obeyed(other):
+def test_barriers_and_quadrics_are_satisfied_with_dynamics(other):
     z = trip()
     g = Constraint((reachable(maze(), weight=WEIGHT), other))
     assert float(other(z).max()) > 1e-3
@@ -436,12 +454,12 @@ def test_chains_and_quadrics_beside_dynamics_are_obeyed(other):
     torch.testing.assert_close(x[:, 0], z[:, 0], atol=1e-12, rtol=0)
 
 
-def test_a_chain_a_disc_and_a_wall_hold_at_once():
+def test_barrier_disc_and_wall_are_satisfied_with_dynamics():
     z = trip()
     g = Constraint(
         (
             reachable(maze(), weight=WEIGHT),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
             AtWaypoints("wall", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.2))),
             DiscreteBarrier("slow", HalfSpace(vec(0.0, 0.0, 1.0, 0.0), num(2.3)), 0.3),
         )
@@ -452,8 +470,10 @@ def test_a_chain_a_disc_and_a_wall_hold_at_once():
     )  # no closed form holds them all at once, and ADMM has not ended
 
 
-def test_a_speed_limit_and_a_disc_hold_at_once():
-    """The limit has no half-spaces at waypoints: its own projection (rate.py) takes turns with the active set."""
+def test_speed_limit_and_disc_are_satisfied_with_dynamics():
+    """The limit has no half-spaces at waypoints: its own projection (rate.py) takes turns with the
+    active set.
+    """
     z = trip()
     one = torch.ones(4, dtype=F64)
     slow = RateLimit(
@@ -469,7 +489,7 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
         (
             reachable(maze(), weight=WEIGHT),
             slow,
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.12, dim=4)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.12, dim=4)),
         )
     )
     assert float(slow(z).max()) > 0.3
@@ -484,11 +504,11 @@ def test_a_speed_limit_and_a_disc_hold_at_once():
 
 def test_two_sets_of_dynamics_are_refused():
     g = Constraint((reachable(maze()), replace(reachable(maze()), name="more")))
-    with pytest.raises(InfeasibleError, match='"dyn" and "more": a plan can obey only one'):
+    with pytest.raises(InfeasibleError, match='"dyn" and "more": a plan can satisfy only one'):
         project(g, torch.zeros(1, 3, 4, dtype=F64), Pins.none(torch.zeros(1, 3, 4, dtype=F64)))
 
 
-def test_split_parts_the_dynamics_from_the_rest():
+def test_split_separates_the_dynamics_from_the_other_parts():
     part, wall = reachable(maze()), AtWaypoints("w", HalfSpace(vec(1.0, 0, 0, 0), num(0.0)))
     assert dynamics_of(Constraint((wall, part))) == [part]
     assert split(Constraint((wall, part))) == (Constraint((wall,)), Constraint((part,)))

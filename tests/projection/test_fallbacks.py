@@ -1,4 +1,6 @@
-"""Projection where no closed form serves: intersections, opaque rows, sequential linearisation, and what is refused."""
+"""Projection where no closed form serves: intersections, opaque rows, sequential linearisation, and
+what is refused.
+"""
 
 import pytest
 import torch
@@ -9,7 +11,7 @@ from cdiff_cli.constraints.state_sets import HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import Constraint, stack
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.errors import InfeasibleError
-from cdiff_cli.projection.infeasible import FILTERED
+from cdiff_cli.projection.infeasible import MAX_FILTERED
 from cdiff_cli.projection.project import project
 from tests.problems import (
     F64,
@@ -28,13 +30,13 @@ from tests.problems import (
     waypoints,
 )
 
-# several, sequential, infeasible --------------------------------------------------------------------------------------
+# several, sequential, infeasible ------------------------------------------------------------------
 
 
-def test_inside_a_ball_and_a_half_space_ends_on_both():
+def test_projection_onto_a_ball_and_a_half_space_ends_on_both_boundaries():
     g = stack(
         [
-            waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0), "b"),
+            waypoints(ball("inside", centre=(0.0, 0.0), radius=1.0), "b"),
             waypoints(HalfSpace(vec(1.0, 0.0), num(0.6)), "h"),
         ]
     )
@@ -44,32 +46,35 @@ def test_inside_a_ball_and_a_half_space_ends_on_both():
     )  # the corner; Dykstra stops at 1e-10 a round
 
 
-def test_outside_two_balls_is_feasible():
+def test_projection_outside_two_balls_is_feasible():
     g = stack(
         [
-            waypoints(ball(1, centre=(0.0, 0.0), radius=1.0), "a"),
-            waypoints(ball(1, centre=(1.5, 0.0), radius=1.0), "b"),
+            waypoints(ball("outside", centre=(0.0, 0.0), radius=1.0), "a"),
+            waypoints(ball("outside", centre=(1.5, 0.0), radius=1.0), "b"),
         ]
     )
     x = free_projection(g, normal(2, 6, 4, 2, scale=0.8))
     assert float(g(x).max()) <= 1e-5  # what project promises of a non-convex intersection
 
 
-def test_opaque_half_space_falls_back_to_linearisation_and_agrees():
+def test_sequential_qp_of_a_black_box_half_space_agrees_with_the_closed_form():
     z = normal(3, 2, 3, 2)
     x = free_projection(opaque(lambda x: x[..., 0] - x[..., 1] - 0.2), z)
     torch.testing.assert_close(x, free_projection(waypoints(half_space()), z), atol=QP, rtol=0)
 
 
-def test_opaque_ball_falls_back_to_linearisation_and_agrees():
+def test_sequential_qp_of_a_black_box_ball_agrees_with_the_closed_form():
     z = normal(4, 3, 2, 2, scale=2.0)
     x = free_projection(opaque(lambda x: x.square().sum(-1) - 1), z)
     torch.testing.assert_close(
-        x, free_projection(waypoints(ball(-1, centre=(0.0, 0.0), radius=1.0)), z), atol=QP, rtol=0
+        x,
+        free_projection(waypoints(ball("inside", centre=(0.0, 0.0), radius=1.0)), z),
+        atol=QP,
+        rtol=0,
     )  # convex: the same
 
 
-def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
+def test_black_box_that_couples_all_waypoints_keeps_the_pins():
     z = torch.zeros(1, 3, 1, dtype=F64)
     z[0, :, 0] = vec(1.0, 1.0, 1.0)
     total = Constraint((BlackBox("sum", lambda x: x.sum((1, 2))[:, None] - 1.0, lambda _: 1),))
@@ -77,12 +82,12 @@ def test_opaque_rows_that_couple_all_waypoints_hold_the_pins():
     torch.testing.assert_close(x.flatten(), vec(1.0, 0.0, 0.0), atol=QP, rtol=0)
 
 
-def test_dcbf_over_an_ellipsoid_is_reached_by_linearisation():
-    g, z = chain(ellipsoid(-1), 0.5), normal(6, 2, 3, 2)
+def test_barrier_over_an_ellipsoid_is_satisfied_by_sequential_qp():
+    g, z = chain(ellipsoid("inside"), 0.5), normal(6, 2, 3, 2)
     assert float(g(free_projection(g, z)).max()) <= 1e-5  # what project promises
 
 
-def test_two_half_spaces_that_exclude_each_other_are_named():
+def test_conflict_of_two_half_spaces_names_both():
     g = stack(
         [
             waypoints(HalfSpace(vec(1.0, 0.0), num(-1.0)), "left"),
@@ -100,10 +105,10 @@ def _slab(name, low, high):
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
-def test_of_two_slabs_that_exclude_each_other_and_a_disc_only_the_two_sides_between_them_are_named(
+def test_conflict_of_two_slabs_names_the_facing_sides_and_not_a_disc(
     order,
 ):
-    disc = waypoints(ball(1, centre=(0.0, 3.0), radius=0.5), "disc")
+    disc = waypoints(ball("outside", centre=(0.0, 3.0), radius=0.5), "disc")
     parts = [_slab("near", -1.0, 1.0), disc, _slab("far", 2.0, 3.0)]
     with pytest.raises(InfeasibleError) as caught:
         free_projection(stack([parts[i] for i in order]), normal(5, 1, 4, 2))
@@ -113,8 +118,8 @@ def test_of_two_slabs_that_exclude_each_other_and_a_disc_only_the_two_sides_betw
     assert not any(name in said for name in ("disc", "near.low", "far.high"))
 
 
-def test_of_more_parts_than_are_left_out_in_turn_the_conflicting_ones_are_still_among_those_named():
-    many = [_slab(f"slab{i}", -1.0 - i, 1.0 + i) for i in range(FILTERED)]
+def test_conflict_beyond_the_filtered_parts_is_still_named():
+    many = [_slab(f"slab{i}", -1.0 - i, 1.0 + i) for i in range(MAX_FILTERED)]
     with pytest.raises(InfeasibleError, match=r"slab0\.high.*far\.low"):
         free_projection(stack([*many, _slab("far", 1.5, 3.0)]), torch.zeros(1, 1, 2, dtype=F64))
 
@@ -142,13 +147,13 @@ def test_a_pinned_coordinate_that_alone_decides_a_row_is_named():
         project(waypoints(HalfSpace(vec(1.0, 0.0), num(0.0)), "wall"), z, pin(z, 1, columns=[0]))
 
 
-def test_pinned_ends_that_contradict_a_chain_between_them_are_named():
+def test_conflict_of_pinned_ends_with_a_barrier_names_the_barrier():
     z = vec(3.0, 2.0, -1.0).reshape(1, 3, 1)  # h = x falls from 3 to -1: a chain never crosses 0
     with pytest.raises(InfeasibleError, match="c@1-2"):
         project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0, 2))
 
 
-def test_two_neighbouring_pinned_waypoints_that_break_a_chain_are_refused():
+def test_two_neighbouring_pinned_waypoints_that_violate_a_barrier_are_refused():
     z = vec(3.0, 0.1, 0.0).reshape(1, 3, 1)
     g = Constraint(
         (

@@ -49,7 +49,7 @@ EXACT = [
 ]
 
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 
 def test_half_space_moves_along_its_normal():
@@ -62,11 +62,11 @@ def test_half_space_moves_along_its_normal():
 @pytest.mark.parametrize(
     ("side", "start", "end"),
     [
-        (1, (0.5, 0.0), (2.0, 0.0)),
-        (1, (0.0, 3.0), (0.0, 3.0)),
-        (1, (0.0, 0.0), (2.0, 0.0)),  # the centre goes along the first axis
-        (-1, (3.0, 4.0), (1.2, 1.6)),
-        (-1, (0.5, 0.0), (0.5, 0.0)),
+        ("outside", (0.5, 0.0), (2.0, 0.0)),
+        ("outside", (0.0, 3.0), (0.0, 3.0)),
+        ("outside", (0.0, 0.0), (2.0, 0.0)),  # the centre goes along the first axis
+        ("inside", (3.0, 4.0), (1.2, 1.6)),
+        ("inside", (0.5, 0.0), (0.5, 0.0)),
     ],
 )
 def test_ball_moves_radially_to_its_sphere(side, start, end):
@@ -77,14 +77,15 @@ def test_ball_moves_radially_to_its_sphere(side, start, end):
 
 
 def test_ball_leaves_coordinates_it_does_not_name():
-    level = Ellipsoid(torch.eye(2, 4, dtype=F64), vec(0.0, 0.0), vec(1.0, 1.0), num(1.0), 1)
+    level = Ellipsoid(torch.eye(2, 4, dtype=F64), vec(0.0, 0.0), vec(1.0, 1.0), num(1.0), "outside")
     x = free_projection(waypoints(level), vec(0.5, 0.0, 7.0, -7.0).reshape(1, 1, 4))
     torch.testing.assert_close(x.flatten(), vec(1.0, 0.0, 7.0, -7.0), atol=1e-15, rtol=0)
 
 
 def test_centre_of_an_ellipsoid_leaves_along_its_short_axis():
     x = free_projection(
-        waypoints(ellipsoid(1, centre=(0.0, 0.0), axes=(3.0, 1.0))), torch.zeros(1, 1, 2, dtype=F64)
+        waypoints(ellipsoid("outside", centre=(0.0, 0.0), axes=(3.0, 1.0))),
+        torch.zeros(1, 1, 2, dtype=F64),
     )
     torch.testing.assert_close(
         x.abs().flatten(), vec(0.0, 1.0), atol=2e-6, rtol=0
@@ -110,13 +111,13 @@ def test_rotated_quadric_of_deficient_rank_leaves_its_null_direction():
     )  # the same, after a rotation
 
 
-def test_chain_of_two_under_gravity_of_the_first():
+def test_barrier_of_two_waypoints_moves_both_by_their_weights():
     # h = x; x' >= x / 2.  (2, 0): minimise (a - 2)^2 + (a / 2)^2, a = 1.6
     x = free_projection(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), vec(2.0, 0.0).reshape(1, 2, 1))
     torch.testing.assert_close(x.flatten(), vec(1.6, 0.8), atol=1e-14, rtol=0)
 
 
-def test_chain_from_a_pinned_start_only_raises_what_follows():
+def test_barrier_from_a_pinned_start_moves_later_waypoints_only():
     z = vec(2.0, 0.0, 0.0).reshape(1, 3, 1)
     x = project(chain(HalfSpace(vec(-1.0), num(0.0)), 0.5), z, pin(z, 0))
     torch.testing.assert_close(x.flatten(), vec(2.0, 1.0, 0.5), atol=1e-14, rtol=0)
@@ -124,7 +125,7 @@ def test_chain_from_a_pinned_start_only_raises_what_follows():
 
 @quick
 @given(seed=seeds, horizon=st.integers(1, 12))
-def test_chain_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon):
+def test_barrier_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon):
     z = normal(seed, 2, horizon, 2)
     x = free_projection(chain(half_space(), 1.0), z)
     clipped = torch.cat((z[:, :1], project_state(half_space(), z[:, 1:])), 1)
@@ -134,12 +135,12 @@ def test_chain_with_alpha_one_is_clipping_after_the_first_waypoint(seed, horizon
 def test_a_plan_at_the_centre_of_a_ball_leaves_it_as_slowly_as_the_barrier_allows():
     z = torch.zeros(1, 3, 2, dtype=F64)
     x = free_projection(
-        chain(ball(1, centre=(0.0, 0.0), radius=1.0), 0.5), z
+        chain(ball("outside", centre=(0.0, 0.0), radius=1.0), 0.5), z
     )  # h = |x| - 1 >= -1: -1, -1/2, -1/4
     torch.testing.assert_close(x.norm(dim=-1), vec(0.0, 0.5, 0.75)[None], atol=1e-14, rtol=0)
 
 
-# properties -----------------------------------------------------------------------------------------------------------
+# properties ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", EXACT)
@@ -157,7 +158,7 @@ def test_projection_is_feasible_and_idempotent(kind, seed, horizon):
 @pytest.mark.parametrize("kind", EXACT)
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds)
-def test_feasible_trajectories_stay_where_they_are(kind, seed):
+def test_feasible_trajectories_are_unchanged(kind, seed):
     z = normal(seed, 40, 2, 2, scale=1.5)
     z = z[(KINDS[kind](z) <= -1e-9).all(1)]
     torch.testing.assert_close(
@@ -213,7 +214,7 @@ def test_float32_projections_are_feasible_to_float32(kind):
     assert float(g(x).max()) <= 1e-5  # values up to about 5, 24 bits
 
 
-# against a QP solver --------------------------------------------------------------------------------------------------
+# against a QP solver ------------------------------------------------------------------------------
 
 
 @quick
@@ -227,7 +228,9 @@ def test_half_space_agrees_with_proxqp(seed):
 @quick
 @given(seed=seeds, n=st.integers(2, 4))
 def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
-    """b > 0 keeps the origin feasible; normals stand 0.9 rad apart or more: Dykstra is slow between nearly parallel walls."""
+    """b > 0 keeps the origin feasible; normals stand 0.9 rad apart or more: Dykstra is slow between
+    nearly parallel walls.
+    """
     z = normal(seed, 1, 3, 2)
     turn = 2.4 * torch.arange(n) + float(normal(seed + 1, 1))
     g = stack(
@@ -241,7 +244,7 @@ def test_stacks_of_half_spaces_agree_with_proxqp(seed, n):
     )  # Dykstra stops when a round moves 1e-10; at sharp corners slower
 
 
-def test_a_half_space_and_a_chain_together_agree_with_proxqp():
+def test_half_space_with_a_barrier_agrees_with_proxqp():
     g, z = (
         stack([chain(half_space(), 0.3), waypoints(HalfSpace(vec(0.0, 1.0), num(0.1)))]),
         normal(7, 3, 5, 2),
@@ -254,7 +257,7 @@ def test_a_half_space_and_a_chain_together_agree_with_proxqp():
 @pytest.mark.parametrize("alpha", [1e-3, 0.02, 0.3, 0.9, 1.0])
 @pytest.mark.parametrize("horizon", [1, 2, 16, 64])
 @pytest.mark.parametrize("pinned", ["free", "start pinned"])
-def test_half_space_chain_agrees_with_proxqp(horizon, alpha, pinned):
+def test_barrier_over_a_half_space_agrees_with_proxqp(horizon, alpha, pinned):
     z = normal(horizon, 2, horizon, 2)
     z[:, 0] = vec(-0.5, 0.5)  # h = 1.2
     g = chain(half_space(), alpha)
@@ -269,7 +272,7 @@ def test_half_space_chain_agrees_with_proxqp(horizon, alpha, pinned):
 
 @settings(max_examples=15, deadline=None)
 @given(seed=seeds, horizon=st.integers(3, 12), alpha=st.floats(1e-3, 1.0))
-def test_chain_between_two_pinned_ends_agrees_with_proxqp(seed, horizon, alpha):
+def test_barrier_between_two_pinned_ends_agrees_with_proxqp(seed, horizon, alpha):
     z = normal(seed, 1, horizon, 2)
     z[:, 0], z[:, -1] = vec(-0.2, 0.2), vec(-0.5, 0.5)  # h rises from 0.6 to 1.2: always possible
     g, pins = chain(half_space(), alpha), pin(z, 0, -1)
@@ -278,7 +281,7 @@ def test_chain_between_two_pinned_ends_agrees_with_proxqp(seed, horizon, alpha):
     torch.testing.assert_close(x, qp_projection(g, z, pins), atol=QP, rtol=0)
 
 
-def test_chain_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
+def test_barrier_moves_only_the_free_coordinates_of_a_partly_pinned_waypoint():
     z = normal(9, 2, 4, 2)
     z[:, 0] = vec(-0.5, 0.5)
     pins = pin(z, 0, 2, columns=[0])
@@ -293,11 +296,13 @@ def test_half_space_moves_only_the_free_coordinate_of_a_pinned_state():
     torch.testing.assert_close(x.flatten(), vec(1.0, -1.0), atol=QP, rtol=0)
 
 
-# against brute force --------------------------------------------------------------------------------------------------
+# against brute force ------------------------------------------------------------------------------
 
 
 def _boundary(level, reach=6.0, n=1201):
-    """Points of {f = 0}: the zeros of f along the lines of a fine grid, each interpolated then polished by Newton steps."""
+    """Points of {f = 0}: the zeros of f along the lines of a fine grid, each interpolated then
+    polished by Newton steps.
+    """
     line = torch.linspace(-reach, reach, n, dtype=F64)
     grid = torch.stack(torch.meshgrid(line, line, indexing="ij"), -1)
     f = level(grid)
@@ -342,7 +347,7 @@ def test_projection_onto_a_random_indefinite_quadric_is_stationary(seed):
     assert bool((along >= 0).all())
 
 
-def test_saddle_projection_is_global_though_two_branches_are_near():
+def test_saddle_projection_is_the_global_one_of_two_near_branches():
     z = vec(3.0, 0.0).reshape(1, 2)
     moved = (project_state(saddle(), z) - z).norm()
     assert float(moved) <= float(nearest_of(_boundary(saddle()), z)) + 1e-8  # 1e-8: bisection
@@ -350,13 +355,14 @@ def test_saddle_projection_is_global_though_two_branches_are_near():
 
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_chain_over_a_ball_exterior_is_feasible_and_optimal_against_brute_force(alpha, seed):
-    level = ball(1, centre=(0.0, 0.0), radius=1.0)
+def test_barrier_outside_a_ball_is_optimal_against_brute_force(alpha, seed):
+    level = ball("outside", centre=(0.0, 0.0), radius=1.0)
     z = normal(seed, 1, 3, 2, scale=0.7)
     g = chain(level, alpha)
     x = free_projection(g, z)
     assert float(g(x).max()) <= 1e-12
-    # only radii matter: each waypoint moves along its own ray, so three radii are searched on a grid
+    # only radii matter: each waypoint moves along its own ray, so three radii are searched on a
+    # grid
     r = torch.linspace(0, 3, 151, dtype=F64)
     a, b, c = torch.meshgrid(r, r, r, indexing="ij")
     length = z.norm(dim=-1)[0]
@@ -369,8 +375,8 @@ def test_chain_over_a_ball_exterior_is_feasible_and_optimal_against_brute_force(
 
 
 @pytest.mark.parametrize("pinned", [False, True])
-def test_chain_over_a_ball_leaves_a_pinned_start(pinned):
-    level = ball(1, centre=(0.0, 0.0), radius=1.0)
+def test_barrier_outside_a_ball_keeps_a_pinned_start(pinned):
+    level = ball("outside", centre=(0.0, 0.0), radius=1.0)
     z = vec(2.0, 0.0, 0.5, 0.1, 0.2, -0.4, 0.0, 0.1).reshape(1, 4, 2)
     g = chain(level, 0.3)
     x = project(g, z, pin(z, 0) if pinned else Pins.none(z))

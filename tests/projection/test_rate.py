@@ -1,4 +1,6 @@
-"""`kind: rate`: known answers, gradients, the projection against ProxQP and its KKT conditions, files, certificates, commands."""
+"""`kind: rate`: known answers, gradients, the projection against ProxQP and its KKT conditions,
+files, certificates, commands.
+"""
 
 import json
 
@@ -9,7 +11,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.load import json_schema, load_constraints
@@ -70,10 +73,10 @@ LIMITS = {
 }
 
 
-# rows -----------------------------------------------------------------------------------------------------------------
+# rows ---------------------------------------------------------------------------------------------
 
 
-def test_rows_are_rates_over_the_limit_in_units_a_second():
+def test_rows_are_rates_above_the_limit_in_units_per_second():
     x = line(0.0, 0.3, 0.1)  # 3 and -2 a second
     torch.testing.assert_close(
         rate(low=-1.0, high=1.0, dt=0.1)(x),
@@ -94,7 +97,7 @@ def test_rows_are_rates_over_the_limit_in_units_a_second():
 @pytest.mark.parametrize("kind", LIMITS)
 @quick
 @given(seed=seeds, horizon=st.integers(2, 6))
-def test_the_pull_is_the_gradient_in_any_frame(kind, seed, horizon):
+def test_pull_of_a_rate_limit_is_its_gradient_in_any_frame(kind, seed, horizon):
     g = pull_back(only(LIMITS[kind]), normal(seed + 2, 2), 0.5 + normal(seed + 3, 2).abs())
     x = normal(seed, 2, horizon, 2).requires_grad_()
     w = normal(seed + 1, 2, horizon - 1)
@@ -106,7 +109,7 @@ def test_the_pull_is_the_gradient_in_any_frame(kind, seed, horizon):
 
 
 @pytest.mark.parametrize("kind", LIMITS)
-def test_the_size_bounds_the_largest_eigenvalue_that_rows_give(kind):
+def test_row_bounds_of_a_rate_limit_bound_the_largest_eigenvalue(kind):
     """Of J J^T, for step sizes; J row by row as the QP of safediffuser takes it."""
     x = normal(0, 1, 7, 2)
     J = jacobian(LIMITS[kind], x)[0].flatten(1)
@@ -124,23 +127,23 @@ def test_a_margin_narrows_the_limits_and_too_wide_a_one_is_refused():
             narrow.tighten(1.5)
 
 
-# the projection -------------------------------------------------------------------------------------------------------
+# the projection -----------------------------------------------------------------------------------
 
 
-def test_two_waypoints_too_far_apart_meet_half_way():
+def test_two_waypoints_too_far_apart_move_equally():
     torch.testing.assert_close(
         free_projection(only(rate(low=-1.0)), line(0.0, 3.0)), line(1.0, 2.0), atol=1e-8, rtol=0
     )
 
 
-def test_a_pinned_start_stays_and_the_rest_waits_for_it():
+def test_pinned_start_stays_and_later_waypoints_follow():
     z = line(0.0, 3.0, 3.0)
     torch.testing.assert_close(
         project(only(rate()), z, pin(z, 0)), line(0.0, 1.0, 2.0), atol=1e-8, rtol=0
     )
 
 
-def test_a_limit_on_the_length_leaves_the_direction():
+def test_limit_on_a_length_keeps_the_direction():
     z = torch.tensor([[[0.0, 0.0], [3.0, 4.0]]], dtype=F64)
     x = project(only(rate(2, (0, 1), norm=True)), z, pin(z, 0))
     torch.testing.assert_close(x[0, 1], torch.tensor([0.6, 0.8], dtype=F64), atol=1e-8, rtol=0)
@@ -148,7 +151,7 @@ def test_a_limit_on_the_length_leaves_the_direction():
 
 @pytest.mark.parametrize("held", [(), (0,), (0, -1), (3,)])
 @pytest.mark.parametrize("bounds", [(-0.7, 0.4), (None, 0.4), (-0.3, None)])
-def test_limits_of_one_coordinate_end_where_proxqp_does(held, bounds):
+def test_limits_on_one_coordinate_agree_with_proxqp(held, bounds):
     """In a frame whose coordinates have different scales, as projections are used."""
     both = (
         Constraint((rate(2, (1,), low=bounds[0], high=bounds[1], dt=0.1),))
@@ -174,8 +177,10 @@ def test_limits_of_one_coordinate_end_where_proxqp_does(held, bounds):
 
 @quick
 @given(seed=seeds, horizon=st.sampled_from([2, 3, 12, 60]), scale=st.sampled_from([0.02, 0.1, 1.0]))
-def test_limits_on_a_length_meet_their_kkt_conditions(seed, horizon, scale):
-    """x - z = D^T m, each m along its difference, not against it, and nothing where the limit is not reached."""
+def test_projection_onto_a_length_limit_satisfies_the_kkt_conditions(seed, horizon, scale):
+    """x - z = D^T m, each m along its difference, not against it, and nothing where the limit is
+    not reached.
+    """
     part, z = LIMITS["length"], scale * normal(seed, 3, horizon, 2)
     x = free_projection(only(part), z)
     assert float(part(x).max()) <= CLOSE[F64]
@@ -198,7 +203,7 @@ def test_limits_on_a_length_meet_their_kkt_conditions(seed, horizon, scale):
 @given(
     seed=seeds, horizon=st.sampled_from([1, 2, 3, 40]), dtype=st.sampled_from([F64, torch.float32])
 )
-def test_the_result_obeys_and_stays_where_it_is(kind, seed, horizon, dtype):
+def test_projection_onto_rate_limits_is_feasible_and_idempotent(kind, seed, horizon, dtype):
     z = (0.1 * normal(seed, 2, horizon, 2)).to(dtype)
     g = only(LIMITS[kind]).to(z)
     x = free_projection(g, z)
@@ -207,13 +212,13 @@ def test_the_result_obeys_and_stays_where_it_is(kind, seed, horizon, dtype):
     torch.testing.assert_close(free_projection(g, x), x, atol=CLOSE[dtype], rtol=0)
 
 
-def test_a_path_that_is_slow_enough_comes_back_bit_for_bit():
+def test_slow_path_is_unchanged_to_the_bit():
     z = 1e-3 * normal(0, 4, 9, 2)
     assert torch.equal(free_projection(only(LIMITS["length"]), z), z)
     assert free_projection(only(LIMITS["length"]), z[:0]).shape == (0, 9, 2)
 
 
-def test_each_plan_s_own_frame_is_used():
+def test_rate_limit_in_a_frame_per_plan_equals_each_plan_alone():
     z, scale = 0.1 * normal(0, 3, 6, 2), 0.5 + normal(1, 3, 1, 2).abs()
     part = LIMITS["slew"].pull_back(torch.zeros(3, 1, 2, dtype=F64), scale)
     x = free_projection(only(part), z)
@@ -224,19 +229,19 @@ def test_each_plan_s_own_frame_is_used():
         torch.testing.assert_close(x[b : b + 1], alone, atol=1e-8, rtol=0)
 
 
-def test_a_projection_begun_where_the_last_one_ended_ends_at_the_same_point():
+def test_warm_started_projection_ends_at_the_same_point():
     z, part = 0.1 * normal(0, 2, 30, 2), LIMITS["length"]
     slowed = RateProjection([part], Pins.none(z))
     slowed(z + 0.01 * normal(1, 2, 30, 2))
     torch.testing.assert_close(slowed(z), free_projection(only(part), z), atol=1e-8, rtol=0)
 
 
-def test_a_disc_a_wall_and_a_limit_hold_together():
+def test_disc_wall_and_rate_limit_are_satisfied_together():
     s = torch.linspace(-2, 2, 41, dtype=F64)
     z = torch.stack((s, 0.2 + 0 * s), -1)[None]
     g = stack(
         [
-            segments(ball(1, centre=(0.0, 0.0), radius=0.5)),
+            segments(ball("outside", centre=(0.0, 0.0), radius=0.5)),
             waypoints(half_space((0.0, 1.0), 0.9), "wall"),
         ]
     )
@@ -260,7 +265,7 @@ def test_pinned_ends_that_the_limit_cannot_join_are_refused_by_name():
         project(only(rate(low=-1.0)), -z, pin(-z, 0, 2))
 
 
-# files ----------------------------------------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------------------
 
 
 def load(folder, entry):
@@ -274,14 +279,14 @@ def load(folder, entry):
 
 def test_a_list_limits_the_length_and_a_name_the_signed_change(tmp_path):
     (kind,), g = load(tmp_path, SLOW)
-    assert (kind.dt, kind.describe()) == (DT, "|change of x, y| <= 2 a second between waypoints")
+    assert (kind.dt, kind.describe()) == (DT, "|rate of x, y| <= 2 per second between waypoints")
     x = torch.tensor([[[0.0, 0, 0, 0], [0.03, 0.04, 9, 9]]], dtype=F64)
     torch.testing.assert_close(g(x), torch.tensor([[3.0]], dtype=F64), atol=1e-12, rtol=0)
     (kind,), g = load(tmp_path, {"kind": "rate", "of": "vx", "min": -5.0, "max": 3.0})
-    assert kind.describe() == "-5 <= change of vx <= 3 a second between waypoints"
+    assert kind.describe() == "-5 <= rate of vx <= 3 per second between waypoints"
     torch.testing.assert_close(g(x), torch.tensor([[897.0]], dtype=F64), atol=1e-9, rtol=0)
     (kind,), _ = load(tmp_path, {"kind": "rate", "of": "vx", "min": -5.0})
-    assert kind.describe() == "-5 <= change of vx a second between waypoints"
+    assert kind.describe() == "-5 <= rate of vx per second between waypoints"
     assert "RateSpec" in json_schema()["$defs"]
 
 
@@ -302,7 +307,7 @@ def test_a_list_limits_the_length_and_a_name_the_signed_change(tmp_path):
         ),
     ],
 )
-def test_a_mistake_is_one_line_with_its_place(entry, complaint, tmp_path):
+def test_mistake_in_a_rate_is_one_line_with_its_place(entry, complaint, tmp_path):
     path = write(tmp_path, f"task: maze2d-umaze\nconstraints:\n  - {entry}\n")
     with pytest.raises(SpecError) as caught:
         load_constraints(path, "maze2d-umaze", LAYOUT, dt=DT)
@@ -319,7 +324,7 @@ def test_waypoints_that_are_not_in_time_have_no_rate(tmp_path):
         load_constraints(path, "gaussian2d", ("x", "y"))
 
 
-def test_a_control_task_is_refused(tmp_path):
+def test_rate_limit_is_refused_for_a_receding_horizon_task(tmp_path):
     layout = load_task("hopper").layout
     path = write(
         tmp_path, f"task: hopper\nconstraints:\n  - {{kind: rate, of: {layout[0]}, max: 1.0}}\n"
@@ -328,7 +333,7 @@ def test_a_control_task_is_refused(tmp_path):
         resolve(Request(task="hopper", constraints=path))
 
 
-# certificates, metrics ------------------------------------------------------------------------------------------------
+# certificates, metrics ----------------------------------------------------------------------------
 
 STILL, FAST = (
     [(0.0, 0.0, 0, 0), (0.01, 0.0, 0, 0), (0.02, 0.01, 0, 0)],
@@ -351,7 +356,7 @@ def test_the_certificate_names_the_worst_segment_and_is_exact(tmp_path):
     verify(make_run(tmp_path / "slow", STILL, kinds=(SLOW,)), code=0)
 
 
-def test_only_the_steps_that_are_too_fast_count(tmp_path):
+def test_metrics_count_only_steps_that_are_too_fast(tmp_path):
     _, g = load(tmp_path, SLOW)
     x = np.array([[*FAST, (0.05, 0.04, 0, 0)]], dtype=np.float64)
     assert unsafe_segments(g, x).tolist() == [1.0]
@@ -359,7 +364,7 @@ def test_only_the_steps_that_are_too_fast_count(tmp_path):
     assert (row["safe_executed"], row["violation_rate"]) == (0.0, 25.0)
 
 
-# commands -------------------------------------------------------------------------------------------------------------
+# commands -----------------------------------------------------------------------------------------
 
 
 def test_a_plan_under_a_speed_limit_obeys_it_and_verifies(tmp_path):
@@ -382,7 +387,7 @@ def test_a_plan_under_a_speed_limit_obeys_it_and_verifies(tmp_path):
     verify(run, code=0)
 
 
-def test_check_says_what_a_rate_means(tmp_path):
+def test_check_describes_a_rate(tmp_path):
     out = cdiff(
         "check", "constraints/maze2d-umaze-rate.yaml", "--picture", tmp_path / "check.png"
     ).stdout
@@ -390,7 +395,7 @@ def test_check_says_what_a_rate_means(tmp_path):
     assert "127" in out  # a row a segment
 
 
-def test_ends_too_far_apart_for_the_limit_end_in_one_line(tmp_path):
+def test_pinned_ends_too_far_apart_end_in_one_line(tmp_path):
     path = write(
         tmp_path,
         "task: maze2d-umaze\nconstraints:\n  - {name: slow, kind: rate, of: [x, y], max: 0.5}\n",
@@ -402,7 +407,7 @@ def test_ends_too_far_apart_for_the_limit_end_in_one_line(tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_random_pairs_are_drawn_within_the_speed(tmp_path):
+def test_random_pairs_can_be_joined_within_the_speed_limit(tmp_path):
     task = load_task("maze2d-umaze")
     _, g = load(tmp_path, SLOW)
     assert fastest(task, g) == 2.0

@@ -1,19 +1,21 @@
-"""Trajectory laws whose score is exact, their true constrained laws, and what separates a method's samples from them.
+"""Trajectory laws with an exact score, their true constrained laws, and measures of the difference.
 
-The law is a mixture of Gaussian-process bridges in the plane: component k is N(m_k, s_k^2 C) in x and in y, with
-C = V diag(l) V^T the covariance of a smooth bridge, zero at the start and the goal. With a = alpha_bar_t
+The law is a mixture of Gaussian-process bridges in the plane: component k is N(m_k, s_k^2 C) in x
+and in y, with C = V diag(l) V^T the covariance of a smooth bridge, zero at the start and the goal.
+With a = alpha_bar_t and v_k = a s_k^2 l + 1 - a
 
-    E[x_0 | x_t] = sum_k w_k(x_t) (m_k + V diag(sqrt(a) s_k^2 l / v_k) V^T (x_t - sqrt(a) m_k)),   v_k = a s_k^2 l + 1 - a
+    E[x_0 | x_t] = sum_k w_k(x_t) (m_k + V diag(sqrt(a) s_k^2 l / v_k) V^T (x_t - sqrt(a) m_k))
     w_k  proportional to  p_k N(x_t; sqrt(a) m_k, V diag(v_k) V^T)
 
-The constrained law is this law given g <= 0 at every waypoint; rejection samples it without any diffusion.
+The constrained law is this law given g <= 0 at every waypoint; rejection samples it without any
+diffusion.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,19 +30,24 @@ from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.evaluation import metrics
 from cdiff_cli.models.denoiser import Denoiser
 from cdiff_cli.models.normaliser import Normaliser
-from cdiff_cli.models.recipe import Preset, load_recipe
+from cdiff_cli.models.planner import Planner
+from cdiff_cli.models.preset import SamplerSettings
+from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.models.schedule import Schedule
-from cdiff_cli.planning.open_loop import plan, polish_plans
+from cdiff_cli.planning.open_loop import plan
+from cdiff_cli.planning.polish import polish_plans
 from cdiff_cli.planning.problem import Problem
 from cdiff_cli.projection.project import project
 from cdiff_cli.sampling import METHODS, make_method
 from cdiff_cli.sampling.baselines import Unconstrained
-from cdiff_cli.sampling.sampler import Method, Step
+from cdiff_cli.sampling.sampler import Method, PlannerKind, Step
 
 Array = NDArray[np.float64]
 F64 = torch.float64
 SCALE = 1.4  # metres a normalised unit, as in the U-maze
-SAFE = 1e-5  # g up to this counts as kept: float32 rounding of a plan that was not polished
+SAFE = (
+    1e-5  # [m] largest g that counts as safe: float32 rounding of a plan without final projection
+)
 
 
 @dataclass(frozen=True)
@@ -58,17 +65,15 @@ class Routes:
     weights: Tensor
     length: float = 0.4
 
-    # the seam to cdiff_cli.tasks: all that planning.plan asks of a task
-    layout = ("x", "y")
-    positions = ("x", "y")
-
     @property
     def horizon(self) -> int:
         return self.means.shape[1]
 
     @cached_property
     def modes(self) -> tuple[Tensor, Tensor]:
-        """Eigenvalues [horizon] and eigenvectors [horizon, horizon] of the bridge's covariance, its largest variance 1."""
+        """Eigenvalues [horizon] and eigenvectors [horizon, horizon] of the bridge's covariance, its
+        largest variance 1.
+        """
         s = torch.linspace(0, 1, self.horizon, dtype=F64)
         r = math.sqrt(5) * (s[:, None] - s).abs() / self.length
         kernel = (1 + r + r * r / 3) * torch.exp(-r)  # Matern 5/2: two derivatives
@@ -85,14 +90,16 @@ class Routes:
         return self.means[k] + self.std[k, None, None] * (vectors * values.sqrt()) @ z
 
     def truth(self, g: Constraint, n: int, generator: torch.Generator) -> tuple[Array, float]:
-        """n exact samples of the law given g <= 0 at every waypoint, and the share of draws that were accepted."""
+        """n exact samples of the law given g <= 0 at every waypoint, and the share of draws that
+        were accepted.
+        """
         kept, drawn = [], 0
         while sum(map(len, kept)) < n:
             x = self.draw(4 * n, generator)
             drawn += len(x)
             kept.append(x[(g(x) <= 0).all(1)])
-        found = torch.cat(kept)
-        return found[:n].numpy(), len(found) / drawn
+        accepted = torch.cat(kept)
+        return accepted[:n].numpy(), len(accepted) / drawn
 
     def denoiser(self, schedule: Schedule) -> Denoiser:
         """(x_t, t) -> E[x_0 | x_t] in normalised coordinates z = x / SCALE, in the dtype of x_t."""
@@ -122,7 +129,9 @@ class Routes:
 
 
 def three_routes(horizon: int = 32) -> Routes:
-    """Over, under and straight through, from (-1.2, 0) to (1.2, 0): 45, 35 and 20 % of the trajectories."""
+    """Over, under and straight through, from (-1.2, 0) to (1.2, 0): 45, 35 and 20 % of the
+    trajectories.
+    """
     s = torch.linspace(0, 1, horizon, dtype=F64)
     x = -1.2 * torch.cos(math.pi * s)  # from rest to rest
     height = torch.tensor([0.9, -0.9, 0.0], dtype=F64)
@@ -133,7 +142,7 @@ def three_routes(horizon: int = 32) -> Routes:
     )
 
 
-# constraints, in metres ---------------------------------------------------------------------------------------------------
+# constraints, in metres ---------------------------------------------------------------------------
 
 
 def _half_space(x: float, y: float, b: float) -> HalfSpace:
@@ -143,7 +152,11 @@ def _half_space(x: float, y: float, b: float) -> HalfSpace:
 def _outside(x: float, y: float, radius: float) -> Ellipsoid:
     one = torch.ones(2, dtype=F64)
     return Ellipsoid(
-        torch.eye(2, dtype=F64), torch.tensor([x, y], dtype=F64), radius * one, radius * one[0], 1
+        torch.eye(2, dtype=F64),
+        torch.tensor([x, y], dtype=F64),
+        radius * one,
+        radius * one[0],
+        "outside",
     )
 
 
@@ -167,31 +180,25 @@ CONSTRAINTS = {
 
 
 def problem(law: Routes, g: Constraint, n_steps: int = 64) -> Problem:
-    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the waypoints, where the truth has it."""
+    """The law in place of a trained model: start and goal pinned, cosine schedule, g at the
+    waypoints, where the truth has it.
+    """
     schedule = Schedule.cosine(n_steps)
     scale = Normaliser(torch.zeros(2, dtype=F64), torch.full((2,), SCALE, dtype=F64))
     start, goal = law.means[0, [0, -1]].numpy()
-    return Problem(
-        law,
-        law.horizon,
-        law.denoiser(schedule),
-        schedule,
-        scale,
-        g,
-        g,
-        start,
-        goal,
-        torch.device("cpu"),
-    )
+    planner = Planner(law.denoiser(schedule), schedule, scale, law.horizon, ("x", "y"))
+    return Problem(planner, declared=g, enforced=g, start=start, goal=goal)
 
 
-# what separates samples from the truth ------------------------------------------------------------------------------------
+# what separates samples from the truth ------------------------------------------------------------
 
 
 def energy_distance(x: Array, y: Array) -> float:
-    """2 E|x - y| - E|x - x'| - E|y - y'|, |.| the root mean square distance of waypoints, in metres.
+    """2 E|x - y| - E|x - x'| - E|y - y'|, |.| the root mean square distance of waypoints, in
+    metres.
 
-    Unbiased (no pair of a sample with itself): zero on average where both have one law, and it can come out negative.
+    Unbiased (no pair of a sample with itself): zero on average where both have one law, and it can
+    come out negative.
     """
     if min(len(x), len(y)) < 2:
         return math.nan
@@ -206,8 +213,9 @@ def route_shares(law: Routes, x: Array) -> Array:
 
 
 def energy_within_routes(law: Routes, x: Array, truth: Array) -> float:
-    """Energy distance of the samples on one route to the true ones on it, mean over the truth's shares: what is left once the
-    mass on each route is right. Routes of fewer than 20 samples on either side are left out.
+    """Energy distance of the samples on one route to the true ones on it, mean over the truth's
+    shares: what is left once the mass on each route is right. Routes of fewer than 20 samples on
+    either side are left out.
     """
     mine, theirs = law.route(x), law.route(truth)
     pairs = [(x[mine == k], truth[theirs == k]) for k in range(len(law.means))]
@@ -224,7 +232,9 @@ def jump_limit(truth: Array) -> float:
 def measure(
     law: Routes, g: Constraint, x: Array, x_free: Array, truth: Array, limit: float
 ) -> dict[str, float]:
-    """Every measure of samples x [n, horizon, 2]; x_free are the unconstrained ones of the same noise."""
+    """Every measure of samples x [n, horizon, 2]; x_free are the unconstrained ones of the same
+    noise.
+    """
     return {
         "energy": energy_distance(x, truth),
         "within": energy_within_routes(law, x, truth),
@@ -236,19 +246,27 @@ def measure(
     }
 
 
-# variants of a method ---------------------------------------------------------------------------------------------------
+# variants of a method -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Latent:
-    """A method on the clean estimate whose shift of it is carried to x_t as well, so that the noise estimate stays:
+    """A method on the clean estimate that shifts the sample x_t along with it.
 
-        x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0),   a, b = alpha_bar_t, alpha_bar_{t-1}
+    The estimated noise therefore stays as it is. With a = alpha_bar_t and b = alpha_bar_{t-1}:
 
-    DDPM's reverse(x0') - reverse(x0) is only beta_t / (1 - a) of that, its coefficient of x0 over sqrt(b). For DDIM the same
-    holds with 1 - sqrt(a (1 - b) / (b (1 - a))). The whole shift is made at each step, so more steps push harder, where
-    the plain one approaches a limit.
+        x_{t-1} = kernel(x_t + sqrt(a) (x0' - x0), x0') = reverse(x0) + sqrt(b) (x0' - x0)
+
+    With DDPM, reverse(x0') - reverse(x0) is only the share beta_t / (1 - a) of that shift: its
+    coefficient of x0 over sqrt(b). With DDIM the share is 1 - sqrt(a (1 - b) / (b (1 - a))). The
+    whole shift is made at each step, so more steps push harder, where the kernel correction
+    approaches a limit.
     """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     inner: Method
     schedule: Schedule
@@ -268,7 +286,12 @@ class Latent:
 
 @dataclass(frozen=True)
 class Over:
-    """Projection of the clean estimate, overdone: x0' = x0 + fold (P(x0) - x0), the last one exact."""
+    """Over-projection of the clean estimate: x0' = x0 + fold (P(x0) - x0); fold 1 at the end."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     fold: float
 
@@ -281,8 +304,13 @@ class Over:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Latent projection that asks the network about the shifted x_t before it goes on: two calls a step."""
+class CalledTwice:
+    """Latent projection that evaluates the network again at the shifted x_t: two calls per step."""
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     schedule: Schedule
     denoiser: Denoiser
@@ -300,7 +328,14 @@ class Asked:
 
 @dataclass(frozen=True)
 class Late:
-    """A method that acts in the last `steps` of n_steps only; before them the sampler is left alone."""
+    """A method that acts in the last `steps` of n_steps only; before them the sampler is left
+    alone.
+    """
+
+    enforces: ClassVar[bool] = True
+    polished: ClassVar[bool] = True
+    candidates: ClassVar[int] = 1
+    planner: ClassVar[PlannerKind] = "unconditional"
 
     inner: Method
     steps: int
@@ -317,47 +352,50 @@ class Late:
         return x, (inner, max(i - 1, 1))
 
 
-# runs ---------------------------------------------------------------------------------------------------------------------
+# runs ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Run:
     """One way to sample the constrained law.
 
-    preset   kernel, extra steps and polish, as in a recipe
-    k        candidates a plan, of which the first that obeys is kept, else the one that violates least
+    sampler  kernel, extra steps and polish; its own `steps` are not used
+    k        candidates per plan; the first safe one is kept, else the one that violates
+             least
     steps    steps of the respaced schedule, None for all
-    repair   a plan of which no candidate obeys: its noise sampled again by this method, None: the polish alone
+    repair   method that samples again where no candidate is safe, with the same noise; None: the
+             polish alone
     """
 
     name: str
     method: Method
-    preset: Preset
+    sampler: SamplerSettings
     k: int = 1
     steps: int | None = None
     repair: Method | None = None
 
 
 def recipe_runs(task: str = "maze2d-umaze") -> list[Run]:
-    """Every method under every preset of a task's recipe; the unconstrained one, alike in all, once."""
-    runs = [Run("diffuser", Unconstrained(), Preset())]
+    """Every method under every preset of a task's recipe; the unconstrained one, alike in all,
+    once.
+    """
+    runs = [Run("diffuser", Unconstrained(), SamplerSettings())]
     for label, preset in load_recipe(task).presets.items():
         for name in METHODS:
             if name not in (
                 "diffuser",
                 "conditional",
             ):  # the one is there, the other needs training
-                own = preset.model_copy(update={"extra_steps": preset.extra_steps_for(name)})
-                runs.append(
-                    Run(f"{name} {label}", make_method(name, preset.methods.get(name, {})), own)
-                )
+                own = preset.of_method(name)
+                method = make_method(name, own.methods[name])
+                runs.append(Run(f"{name} {label}", method, own.sampler))
     return runs
 
 
 def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
     """What `recommended` could be instead, all with its final polish."""
-    preset = load_recipe(task).presets["recommended"]
-    schedule, n_steps = at.schedule, at.schedule.n_steps
+    preset, schedule = load_recipe(task).presets["recommended"], at.planner.schedule
+    sampler, n_steps = preset.sampler, schedule.n_steps
     few = schedule.respaced(n_steps // 4)
     clean = {
         name: make_method(name, preset.methods[name])
@@ -368,28 +406,28 @@ def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
     plain = Unconstrained()
     return [
         *(
-            Run(f"latent {name}", Latent(method, schedule), preset)
+            Run(f"latent {name}", Latent(method, schedule), sampler)
             for name, method in clean.items()
         ),
-        Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), preset),
-        Run("latent projected, 2 calls", Asked(schedule, at.denoiser), preset),
-        Run("latent projected, last half", Latent(half, schedule), preset),
-        Run("projected, last half", half, preset),
-        Run("projected, final only", Late(projected, 1, n_steps), preset),
-        Run(f"best of 4, {few.n_steps} steps", plain, preset, k=4, steps=few.n_steps),
+        Run("latent projected, 1.5-fold", Latent(Over(1.5), schedule), sampler),
+        Run("latent projected, 2 calls", CalledTwice(schedule, at.planner.denoiser), sampler),
+        Run("latent projected, last half", Latent(half, schedule), sampler),
+        Run("projected, last half", half, sampler),
+        Run("projected, final only", Late(projected, 1, n_steps), sampler),
+        Run(f"best of 4, {few.n_steps} steps", plain, sampler, k=4, steps=few.n_steps),
         Run(
             f"best of 4, {few.n_steps} steps, else latent",
             plain,
-            preset,
+            sampler,
             k=4,
             steps=few.n_steps,
             repair=Latent(projected, few),
         ),
-        Run(f"best of 4, {n_steps} steps", plain, preset, k=4),
+        Run(f"best of 4, {n_steps} steps", plain, sampler, k=4),
         Run(
             f"best of 4, {n_steps} steps, else latent",
             plain,
-            preset,
+            sampler,
             k=4,
             repair=Latent(projected, schedule),
         ),
@@ -397,15 +435,15 @@ def variant_runs(at: Problem, task: str = "maze2d-umaze") -> list[Run]:
 
 
 def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
-    """Samples [n, horizon, 2], one a seed, and network calls a plan, counted at the denoiser."""
-    asked = 0
+    """Samples [n, horizon, 2], one per seed, and the network calls per plan."""
+    calls = 0
 
     def counted(z: Traj, t: int) -> Traj:
-        nonlocal asked
-        asked += len(z)
-        return at.denoiser(z, t)
+        nonlocal calls
+        calls += len(z)
+        return at.planner.denoiser(z, t)
 
-    here = replace(
+    respaced = replace(
         at,
         denoiser=counted,
         schedule=at.schedule if run.steps is None else at.schedule.respaced(run.steps),
@@ -414,19 +452,25 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
 
     def plans(method: Method, draws: Sequence[int]) -> Array:
         kernel, extra = preset.kernel, preset.extra_steps
-        return plan(here, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish).x
+        return plan(
+            respaced, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish
+        ).x
 
     if run.k == 1:
         x = plans(
-            replace(run.method, denoiser=counted) if isinstance(run.method, Asked) else run.method,
+            replace(run.method, denoiser=counted)
+            if isinstance(run.method, CalledTwice)
+            else run.method,
             seeds,
         )
-        return x, asked / len(seeds)
+        return x, calls / len(seeds)
     draws = (
         np.array(seeds) + 10_000_000 * np.arange(run.k)[:, None]
     )  # [k, n], the first those of every other run
-    candidates = plans(run.method, draws.ravel().tolist()).reshape(run.k, len(seeds), at.horizon, 2)
-    worst = np.stack([metrics.worst_waypoint(at.g, x) for x in candidates]).clip(min=0)
+    candidates = plans(run.method, draws.ravel().tolist()).reshape(
+        run.k, len(seeds), at.planner.horizon, 2
+    )
+    worst = np.stack([metrics.worst_waypoint(at.declared, x) for x in candidates]).clip(min=0)
     best, each = worst.argmin(0), np.arange(len(seeds))
     x, bad = candidates[best, each], worst[best, each] > 0
     if bad.any() and run.repair is not None:
@@ -434,4 +478,4 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
     elif bad.any():
         z = at.normaliser.encode(torch.from_numpy(x[bad]))
         x[bad] = at.normaliser.decode(polish_plans(at, z)[0]).numpy()
-    return x, asked / len(seeds)
+    return x, calls / len(seeds)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.errors import CdiffError
@@ -49,20 +50,20 @@ def plans(method, g):
     ).x
 
 
-def test_guidance_pushes_every_row_by_its_weight_violated_or_not():
+def test_guidance_pushes_along_satisfied_and_violated_rows_alike():
     x = normal(0, 3, 4, 2)
     for b in (-9.0, 9.0):
         out, _ = Guidance(weight=0.25).step(step_of(x), waypoints(half_space(b=b)), None)
         torch.testing.assert_close(out, x / 2 - 0.25 * vec(1.0, -1.0))
 
 
-def test_guidance_leaves_pins_alone():
+def test_guidance_does_not_move_pinned_states():
     x = normal(0, 3, 4, 2)
     out, _ = Guidance().step(step_of(x, pins=pin(x, 0)), waypoints(half_space()), None)
     assert torch.equal(out[:, 0], x[:, 0] / 2)
 
 
-def test_terminal_is_the_projection_with_latent_correction():
+def test_terminal_equals_projected_with_latent_correction():
     """By hand: x_{t-1} = reverse(x0) + sqrt(alpha_bar_{t-1}) (P_C(x0) - x0)."""
     terminal, g = make_method("terminal", {}), waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
     assert terminal == CleanProjected(correction="latent")
@@ -81,11 +82,11 @@ def test_terminal_has_no_settings_and_records_none(setting):
         resolve(Request(task="gaussian2d", method="terminal", settings=(setting,)))
     resolved = resolve(Request(task="gaussian2d", method="terminal"))
     assert resolved.method == CleanProjected(correction="latent")
-    assert resolved.config()["method"] == {"terminal": {}}
+    assert resolved.record()["preset"]["methods"] == {"terminal": {}}
     assert resolved.row()["method"] == "terminal"
 
 
-def test_the_final_projection_is_the_unconstrained_plan_projected():
+def test_final_projection_equals_the_projected_unconstrained_plan():
     g = waypoints(HalfSpace(vec(1.0, 1.0), num(0.8)))
     free = plans(Unconstrained(), g)
     assert float(g(free).max()) > 0.1
@@ -108,7 +109,7 @@ def test_best_of_one_is_the_unconstrained_plan(gaussian):
     np.testing.assert_array_equal(one.chain, free.chain)
 
 
-def test_best_of_k_keeps_the_least_violation_of_its_candidates_and_counts_their_calls(gaussian):
+def test_best_of_k_keeps_the_candidate_with_least_violation_and_counts_all_calls(gaussian):
     tight = replace(gaussian.problem, enforced=gaussian.problem.g.tighten(3.0))
     best = plan(tight, BestOf(3), [0, 1, 2, 3])
     tries = [
@@ -126,9 +127,9 @@ def test_best_of_k_keeps_the_least_violation_of_its_candidates_and_counts_their_
     assert best.calls == 60
 
 
-def test_best_of_k_keeps_the_seeds_own_plan_where_it_is_safe(gaussian):
+def test_best_of_k_keeps_the_first_candidate_where_it_is_safe(gaussian):
     free = plan(gaussian.problem, Unconstrained(), gaussian.seeds).x
-    safe = (gaussian.problem.g(torch.from_numpy(free)) <= 0).all(1).numpy()
+    safe = (gaussian.problem.declared(torch.from_numpy(free)) <= 0).all(1).numpy()
     assert safe.sum() > 0
     np.testing.assert_array_equal(
         plan(gaussian.problem, BestOf(4), gaussian.seeds).x[safe], free[safe]
@@ -141,11 +142,11 @@ def test_candidates_of_neighbouring_seeds_share_no_noise():
     assert max(seeds) < 2**32  # torch's generator takes the low 32 bits of a seed
 
 
-def test_every_method_has_its_place_in_tables_and_help():
+def test_tables_and_help_list_every_method_in_registry_order():
     assert tuple(METHODS) == METHOD_ORDER
 
 
-def test_only_these_methods_are_treated_differently():
+def test_class_attributes_of_the_methods():
     methods = {name: make_method(name, {}) for name in METHODS}
     assert {name for name, method in methods.items() if not method.enforces} == {
         "diffuser",

@@ -1,4 +1,4 @@
-"""Constrained sampling where the truth is known: the exact denoiser, the rejection truth, and what holds of the methods there."""
+"""Constrained sampling where the truth is known, with exact denoisers and rejection samples."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,7 @@ import torch
 from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.trajectory import Constraint
 from cdiff_cli.evaluation import metrics
-from cdiff_cli.models.recipe import Preset
+from cdiff_cli.models.preset import SamplerSettings
 from cdiff_cli.models.schedule import Schedule
 from cdiff_cli.sampling import load_kernel
 from cdiff_cli.sampling.clean_methods import CleanProjected
@@ -68,11 +68,11 @@ def noisy(law, a, n=5):
     return x
 
 
-# the law --------------------------------------------------------------------------------------------------------------
+# the law ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("t", [1, 20, 50, 64])
-def test_the_denoiser_of_one_gaussian_is_its_closed_form(t):
+def test_denoiser_of_one_gaussian_equals_its_closed_form(t):
     """E[x_0 | x_t] = m + sqrt(a) S (a S + (1 - a) I)^-1 (x_t - sqrt(a) m)."""
     law = Routes(LAW.means[:1], LAW.std[:1], torch.ones(1, dtype=F64))
     a, m = SCHEDULE.alpha_bar[t], law.means[0] / SCALE
@@ -85,8 +85,10 @@ def test_the_denoiser_of_one_gaussian_is_its_closed_form(t):
 
 
 @pytest.mark.parametrize("t", [1, 20, 50, 64])
-def test_the_denoiser_of_the_mixture_obeys_tweedie(t):
-    """sqrt(a) E[x_0 | x_t] = x_t + (1 - a) grad log p_t(x_t), the density written by torch, its gradient by autograd."""
+def test_denoiser_of_the_mixture_satisfies_tweedies_formula(t):
+    """sqrt(a) E[x_0 | x_t] = x_t + (1 - a) grad log p_t(x_t), the density written by torch, its
+    gradient by autograd.
+    """
     a = SCHEDULE.alpha_bar[t]
     identity = torch.eye(LAW.horizon, dtype=F64)
     noise = [a * (s / SCALE) ** 2 * covariance(LAW) + (1 - a) * identity for s in LAW.std]
@@ -114,9 +116,10 @@ def test_float32_is_enough_for_the_denoiser():
         torch.testing.assert_close(clean(x.float(), t).double(), clean(x, t), atol=2e-4, rtol=0)
 
 
-def test_unconstrained_ddpm_samples_are_the_law_up_to_the_floor():
-    """Over 600 plans the energy distance of 64 steps is of the size of truth against truth (its standard deviation 0.002);
-    the same measure sees the 0.05 and more by which the constrained laws differ.
+def test_unconstrained_ddpm_samples_have_the_law_up_to_sampling_error():
+    """Over 600 plans the energy distance of 64 steps is of the size of truth against truth (its
+    standard deviation 0.002); the same measure sees the 0.05 and more by which the constrained laws
+    differ.
     """
     at = problem(LAW, Constraint(()))
     x = execute(recipe_runs()[0], at, range(600))[0]
@@ -132,7 +135,7 @@ def test_the_truth_satisfies_the_constraint_and_is_not_rare(name):
     assert 0.05 < acceptance < 0.95
 
 
-# the measures ---------------------------------------------------------------------------------------------------------
+# the measures -------------------------------------------------------------------------------------
 
 
 def test_energy_distance_of_two_points_is_twice_their_distance():
@@ -142,7 +145,9 @@ def test_energy_distance_of_two_points_is_twice_their_distance():
 
 
 def test_energy_distance_of_one_law_to_itself_is_zero_on_average():
-    """300 pairs of 100: the mean within four of its standard errors (0.0007); with each sample paired to itself it were 0.016."""
+    """300 pairs of 100: the mean within four of its standard errors (0.0007); with each sample
+    paired to itself it were 0.016.
+    """
     rng = generator(5)
     each = [
         energy_distance(LAW.draw(100, rng).numpy(), LAW.draw(100, rng).numpy()) for _ in range(300)
@@ -158,7 +163,7 @@ def test_energy_within_routes_ignores_the_mass_on_each():
 
 
 def test_routes_of_the_exact_samples_have_the_weights_of_the_mixture():
-    """Up to sampling, and to the few percent of the side routes that lie nearer to the middle one."""
+    """Up to sampling, and to the few percent of side routes that lie nearer to the middle one."""
     np.testing.assert_allclose(
         route_shares(LAW, LAW.draw(4000, generator(0)).numpy()), LAW.weights, atol=0.04
     )
@@ -175,7 +180,7 @@ def test_a_waypoint_out_of_line_is_torn_and_the_truth_is_not():
     assert row["distance"] == pytest.approx(0.25)
 
 
-# the methods ----------------------------------------------------------------------------------------------------------
+# the methods --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -183,12 +188,12 @@ def test_a_waypoint_out_of_line_is_torn_and_the_truth_is_not():
     ["projected recommended", "primal-dual recommended", "alm recommended", "latent projected"],
 )
 @pytest.mark.parametrize("name", CONSTRAINTS)
-def test_no_waypoint_of_a_polished_plan_is_unsafe(name, run):
+def test_polished_plans_are_safe_at_every_waypoint(name, run):
     assert metrics.violation(CONSTRAINTS[name], samples(name, run, 0, n=120)).max() == 0
 
 
 @pytest.mark.parametrize("name", CONSTRAINTS)
-def test_the_polish_alone_leaves_no_violation(name):
+def test_final_projection_alone_removes_every_violation(name):
     """Final-only projection: the unconstrained plans violate, the polished ones do not at all."""
     assert (
         metrics.worst_waypoint(CONSTRAINTS[name], samples(name, "diffuser", 0)) > SAFE
@@ -200,7 +205,9 @@ def test_the_polish_alone_leaves_no_violation(name):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_clean_projection_is_nearer_the_truth_than_noisy_on_long_trajectories(seed):
-    """128 waypoints, a cut corner: within the routes 0.001-0.006 m against 0.21-0.23 m, measured over eight batches."""
+    """128 waypoints, a cut corner: within the routes 0.001-0.006 m against 0.21-0.23 m, measured
+    over eight batches.
+    """
     law = three_routes(128)
     exact = truth("corner", seed, law=law)
     clean, noisy = (
@@ -240,7 +247,9 @@ def test_final_only_projection_tears_plans_that_the_latent_one_keeps_whole(seed)
 
 @pytest.mark.parametrize("kernel", ["ddpm", "ddim"])
 def test_the_latent_step_is_the_kernel_from_the_shifted_sample(kernel):
-    """reverse(x0) + sqrt(b) d = kernel(x_t + sqrt(a) d, x0 + d), and the noise estimate of both is the same."""
+    """reverse(x0) + sqrt(b) d = kernel(x_t + sqrt(a) d, x0 + d), and the noise estimate of both is
+    the same.
+    """
     g, i = CONSTRAINTS["slab"], 30
     a, b = SCHEDULE.alpha_bar[i], SCHEDULE.alpha_bar[i - 1]
     x, x0, z = (normal(seed, 4, 32, 2) for seed in range(3))
@@ -281,11 +290,13 @@ def test_network_calls_are_counted_at_the_network(run, calls):
     assert execute(runs[run], at, seeds(0, 4))[1] == calls
 
 
-def test_runs_without_a_constraint_are_the_plain_sampler():
+def test_runs_without_a_constraint_equal_the_unconstrained_sampler():
     at = problem(LAW, Constraint(()))
     free = execute(recipe_runs()[0], at, seeds(0, 10))[0]
     for run in (*recipe_runs(), *variant_runs(at)):
-        if run.k == 1 and run.preset.extra_steps == 0 and "2 calls" not in run.name:
+        if run.k == 1 and run.sampler.extra_steps == 0 and "2 calls" not in run.name:
             np.testing.assert_allclose(
-                execute(replace(run, preset=Preset()), at, seeds(0, 10))[0], free, atol=1e-6
+                execute(replace(run, sampler=SamplerSettings()), at, seeds(0, 10))[0],
+                free,
+                atol=1e-6,
             )

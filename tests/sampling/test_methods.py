@@ -61,8 +61,9 @@ def _step(x, x0=None, beta=0.1, pins=None):
 def _unit_mean_shift(method):
     x, states = langevin_chain(method, UNIT_MEAN_SHIFT, steps=1200, batch=2000, beta=0.1, seed=0)
     lam = torch.stack([getattr(state, "lam", state) for state in states[400:]]).mean()
-    # The unadjusted chain's std is 1 / sqrt(1 - beta / 4) = 1.0128; standard errors of 2000 draws: std 0.016, mean 0.022.
-    # The multiplier is a time average over 800 steps, 20 relaxation times of such means: standard error below 0.01.
+    # The unadjusted chain's std is 1 / sqrt(1 - beta / 4) = 1.0128; standard errors of 2000 draws:
+    # std 0.016, mean 0.022. The multiplier is a time average over 800 steps, 20 relaxation times of
+    # such means: standard error below 0.01.
     assert float(lam) == pytest.approx(1.0, abs=0.03)
     assert float(x.mean()) == pytest.approx(1.0, abs=0.1)
     assert float(x.std()) == pytest.approx(1.0128, abs=0.06)
@@ -91,7 +92,7 @@ def test_multiplier_of_a_slack_mean_constraint_is_zero():
     )  # the mean is 22 standard errors below 1: never a positive push
 
 
-def test_noisy_primal_dual_step_is_the_papers_equations():
+def test_printed_primal_dual_step_equals_the_papers_equations():
     x = vec(0.0, 3.0).reshape(2, 1, 1)
     out, lam = PrimalDual(eta=0.5).step(
         _step(x, beta=0.2), UNIT_MEAN_SHIFT, vec(2.0, 0.4).reshape(2, 1)
@@ -101,7 +102,7 @@ def test_noisy_primal_dual_step_is_the_papers_equations():
     torch.testing.assert_close(lam.flatten(), vec(2.5, 0.0))
 
 
-def test_noisy_alm_step_is_the_papers_equations():
+def test_printed_alm_step_equals_the_papers_equations():
     x = vec(0.0, 3.0).reshape(2, 1, 1)
     method = AugmentedLagrangian(rho=0.5, c=1.1)
     init = method.init(x, UNIT_MEAN_SHIFT)._replace(lam=vec(2.0, 1.4).reshape(2, 1))
@@ -121,7 +122,7 @@ def test_coefficient_one_does_not_scale_the_push_by_beta():
     assert float(out) == pytest.approx(2.0)
 
 
-def test_batch_mean_keeps_one_multiplier_for_all_plans():
+def test_batch_mean_has_one_multiplier_vector_for_all_plans():
     x = normal(0, 5, 3, 2)
     assert CleanPrimalDual(expectation="batch_mean").init(x, waypoints(half_space())).shape == (
         1,
@@ -168,7 +169,7 @@ def test_clean_multiplier_of_one_half_space_is_exact_after_one_step(method):
     "method",
     [CleanPrimalDual(), PrimalDual(), CleanAugmentedLagrangian(), AugmentedLagrangian()],
 )
-def test_pushes_leave_pinned_waypoints_alone(method):
+def test_dual_methods_do_not_move_pinned_waypoints(method):
     x = normal(3, 4, 5, 2, scale=2.0)
     g, pins = waypoints(half_space(b=-3.0)), pin(x, 0, -1)
     state = method.init(x, g)
@@ -236,10 +237,12 @@ def test_clean_methods_end_on_the_half_space(method, extra_steps, most):
 
 
 def _through_a_disc(method, offset=0.02, horizon=96):
-    """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as the segments see it."""
+    """Plans whose law is a straight line through a disc of radius 0.5, ends pinned, and the disc as
+    the segments see it.
+    """
     s = torch.linspace(-2, 2, horizon, dtype=F64)
     line = torch.stack((s, torch.full_like(s, offset)), -1)[None]
-    g = Constraint((OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),))
+    g = Constraint((OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),))
     noise = draws(11, 1, horizon, 2)
     return sample(
         gaussian_denoiser(SCHEDULE, line, 1e-3),
@@ -257,7 +260,7 @@ def _through_a_disc(method, offset=0.02, horizon=96):
     [CleanProjected(), CleanPrimalDual(), CleanAugmentedLagrangian()],
     ids=["projected", "primal-dual", "alm"],
 )
-def test_clean_methods_go_round_a_disc_without_tearing(method):
+def test_clean_methods_lead_a_path_around_a_disc_without_tearing(method):
     x, g = _through_a_disc(method)
     assert (
         float(x[0].diff(dim=0).norm(dim=-1).max()) <= 4 * 4 / 95
@@ -268,12 +271,12 @@ def test_clean_methods_go_round_a_disc_without_tearing(method):
 @pytest.mark.parametrize("on", ["noisy", "estimate", "clean"])
 @pytest.mark.parametrize("expectation", ["per_sample", "batch_mean"])
 @pytest.mark.parametrize("name", ["primal-dual", "alm"])
-def test_multipliers_of_segments_keep_their_places_and_pins_stay(name, on, expectation):
+def test_multipliers_of_segments_keep_their_number_and_pins_stay(name, on, expectation):
     x = torch.linspace(-1, 1, 12, dtype=F64)[None, :, None] + 0.1 * normal(8, 3, 12, 2)
     g = Constraint(
         (
             AtWaypoints("wall", half_space()),
-            OnSegments("disc", ball(1, centre=(0.0, 0.0), radius=0.5)),
+            OnSegments("disc", ball("outside", centre=(0.0, 0.0), radius=0.5)),
         )
     )
     method = make_method(name, {"on": on, "expectation": expectation})
@@ -294,12 +297,12 @@ def test_multipliers_of_segments_keep_their_places_and_pins_stay(name, on, expec
 @pytest.mark.parametrize(
     "method", [CleanPrimalDual(), CleanAugmentedLagrangian(c=1.5)], ids=["primal-dual", "alm"]
 )
-def test_clean_duals_do_not_move_plans_that_are_safe_already(method):
+def test_clean_dual_methods_do_not_change_safe_plans(method):
     g = waypoints(half_space(b=50.0))
     assert torch.equal(_plan(method, g), _plan(Unconstrained(), g))
 
 
-def test_every_method_meets_the_same_noise():
+def test_every_method_gets_the_same_noise():
     g, seen = waypoints(half_space(b=50.0)), []
     for method in (
         Unconstrained(),
@@ -322,7 +325,7 @@ def test_every_method_meets_the_same_noise():
 
 def test_silu_replaces_g_by_its_smooth_positive_part_and_its_slope():
     x = normal(4, 3, 2, 2)
-    g = waypoints(ball(1))
+    g = waypoints(ball("outside"))
     lam = normal(5, 3, 2).abs()
     leaf = x.clone().requires_grad_()
     smooth = torch.nn.functional.silu(g(leaf))
@@ -344,7 +347,7 @@ def test_silu_keeps_multipliers_finite_through_a_whole_plan(name):
     assert bool(out.isfinite().all())
 
 
-def test_alm_penalty_on_clean_stops_growing_at_one():
+def test_clean_alm_penalty_stops_growing_at_one():
     x = normal(6, 2, 2, 2)
     g, method = waypoints(half_space()), CleanAugmentedLagrangian(c=3.0)
     state = method.init(x, g)
@@ -353,7 +356,7 @@ def test_alm_penalty_on_clean_stops_growing_at_one():
     assert state.rho == 1.0
 
 
-def test_make_method_builds_each_of_them_with_its_defaults():
+def test_make_method_builds_every_method_with_its_defaults():
     assert {name: make_method(name, {}) for name in METHODS} == {
         "diffuser": Unconstrained(),
         "guidance": Guidance(),
@@ -391,7 +394,7 @@ def test_all_forms_of_a_method_have_the_same_defaults():
             assert vars(make_method(name, {"on": on})).items() <= defaults.items()
 
 
-def test_settings_are_recorded_whole_whichever_form_uses_them():
+def test_complete_settings_have_the_fields_of_all_forms():
     assert complete_settings("projected", {"on": "noisy", "correction": "latent"}) == {
         "on": "noisy",
         "correction": "latent",
@@ -440,7 +443,9 @@ def test_make_method_says_what_is_wrong(name, values, message):
 
 
 def test_latent_correction_moves_the_sample_by_the_whole_projection():
-    """x_{t-1} = reverse(x0) + level (P(x0) - x0), by hand: x0 = 2 projected onto x <= 1, reverse halves, level 0.8."""
+    """x_{t-1} = reverse(x0) + level (P(x0) - x0), by hand: x0 = 2 projected onto x <= 1, reverse
+    halves, level 0.8.
+    """
     x = torch.full((1, 1, 1), 2.0)
     step = Step(x, x, 0.1, 0.8, lambda clean: clean / 2, Pins.none(x), False)
     g = waypoints(HalfSpace(torch.ones(1), torch.ones(())))

@@ -1,4 +1,6 @@
-"""The schedule, the kernels against a Gaussian whose denoiser is exact, the sampling loop and its noise."""
+"""The schedule, the kernels against a Gaussian whose denoiser is exact, the sampling loop and its
+noise.
+"""
 
 import math
 from itertools import pairwise
@@ -51,19 +53,20 @@ def _gaussian(kernel, n_steps, n=N):
     ).x
 
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("kernel", "n_steps"), [(ddpm, 1000), (ddim, 200)])
 def test_ddpm_and_ddim_reproduce_a_gaussian_with_its_exact_denoiser(kernel, n_steps):
     x = _gaussian(kernel, n_steps)
-    # discretisation narrows in 1 / n_steps: 3 to 4 percent here (ddpm has 6.7 at 200 steps); the rest is sampling
+    # discretisation narrows in 1 / n_steps: 3 to 4 percent here (ddpm has 6.7 at 200 steps); the
+    # rest is sampling
     assert float(x.mean()) == pytest.approx(MEAN, abs=0.005)
     assert float(x.std()) == pytest.approx(STD, rel=0.06)
 
 
 @pytest.mark.parametrize("n_steps", [200, 1000])
-def test_the_printed_langevin_step_does_not_reproduce_it(n_steps):
+def test_printed_langevin_step_does_not_reproduce_the_gaussian(n_steps):
     assert (
         0.2 < float(_gaussian(langevin, n_steps, 2000).std()) < 0.28
     )  # twice too wide, at any number of steps
@@ -76,7 +79,7 @@ def test_ddpm_narrows_to_the_true_std_with_more_steps():
     )  # first order in 1 / n_steps, seen through a sampling error of 0.0008
 
 
-def test_all_kernels_are_named():
+def test_kernel_table_names_every_kernel():
     assert {"ddpm": ddpm, "ddim": ddim, "dpm++2m": dpmpp_2m, "langevin": langevin} == {
         name: load_kernel(name) for name in KERNELS
     }
@@ -84,8 +87,10 @@ def test_all_kernels_are_named():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), i=st.integers(2, 50))
-def test_ddpm_moments_are_bayes_rule(seed, i):
-    """x_{t-1} of the prior N(sqrt(b) x0, 1 - b) and the likelihood N(x_t; sqrt(1 - beta) x_{t-1}, beta)."""
+def test_ddpm_moments_equal_bayes_rule(seed, i):
+    """x_{t-1} of the prior N(sqrt(b) x0, 1 - b) and the likelihood N(x_t; sqrt(1 - beta) x_{t-1},
+    beta).
+    """
     schedule = Schedule.cosine(50)
     a, b, beta = schedule.alpha_bar[i], schedule.alpha_bar[i - 1], schedule.beta(i)
     x, x0 = normal(seed, 1, 1, 1), normal(seed + 1, 1, 1, 1)
@@ -101,7 +106,7 @@ def test_ddpm_moments_are_bayes_rule(seed, i):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), i=st.integers(1, 50))
-def test_ddim_keeps_the_noise_direction_it_sees(seed, i):
+def test_ddim_keeps_the_estimated_noise(seed, i):
     schedule = Schedule.cosine(50)
     a, b = schedule.alpha_bar[i], schedule.alpha_bar[i - 1]
     x0, e = normal(seed, 1, 2, 2), normal(seed + 1, 1, 2, 2)
@@ -112,7 +117,7 @@ def test_ddim_keeps_the_noise_direction_it_sees(seed, i):
 
 
 @pytest.mark.parametrize("kernel", [ddpm, ddim, dpmpp_2m])
-def test_the_last_step_is_the_clean_estimate(kernel):
+def test_last_step_returns_the_clean_estimate(kernel):
     x, x0, before = normal(0, 2, 3, 2), normal(1, 2, 3, 2), normal(2, 2, 3, 2)
     alpha_bar = Schedule.cosine(50).alpha_bar
     out = kernel(x, x0, torch.zeros_like(x), alpha_bar[1], 1.0, (before, alpha_bar[2]))
@@ -120,8 +125,8 @@ def test_the_last_step_is_the_clean_estimate(kernel):
 
 
 def _flow_error(kernel, schedule, std):
-    """Root mean square distance of N(MEAN, std^2) sampled to the exact end of the probability flow from the same x_T: along it
-    (x - sqrt(a) mean) / sqrt(a std^2 + 1 - a) is constant.
+    """Root mean square distance of N(MEAN, std^2) sampled to the exact end of the probability flow
+    from the same x_T: along it (x - sqrt(a) mean) / sqrt(a std^2 + 1 - a) is constant.
     """
     x = normal(0, 200, 1, 1)
     start, stop = schedule.alpha_bar[-1], schedule.alpha_bar[0]
@@ -152,7 +157,8 @@ def test_half_log_snr_inverts_its_sigmoid():
 @pytest.mark.parametrize(("kernel", "ratio"), [(ddim, 2.0), (dpmpp_2m, 4.0)])
 def test_twice_the_steps_halve_the_error_of_ddim_and_quarter_that_of_dpm_2m(kernel, ratio, std):
     errors = [_flow_error(kernel, _even_in_log_snr(n), std) for n in (64, 128, 256)]
-    # the next term of the error is a factor of some units / n below the leading one: measured ratios 3.87 to 4.06, 1.99 to 2.00
+    # the next term of the error is a factor of some units / n below the leading one: measured
+    # ratios 3.87 to 4.06, 1.99 to 2.00
     assert errors[0] / errors[1] == pytest.approx(ratio, rel=0.05)
     assert errors[1] / errors[2] == pytest.approx(ratio, rel=0.025)
 
@@ -161,7 +167,8 @@ def test_twice_the_steps_halve_the_error_of_ddim_and_quarter_that_of_dpm_2m(kern
 @pytest.mark.parametrize("n_steps", [5, 8, 16, 32])
 def test_few_steps_of_dpm_2m_are_closer_to_the_flow_than_as_many_of_ddim(std, n_steps):
     schedule = Schedule.cosine(64).respaced(n_steps)
-    # measured: 0.97 of ddim's at 5 steps of the narrow law, whose last step decides; at most 0.83 elsewhere
+    # measured: 0.97 of ddim's at 5 steps of the narrow law, whose last step decides; at most 0.83
+    # elsewhere
     assert _flow_error(dpmpp_2m, schedule, std) < _flow_error(ddim, schedule, std)
 
 
@@ -173,7 +180,7 @@ def test_16_steps_of_dpm_2m_are_closer_than_32_of_ddim():
         )
 
 
-def test_the_first_step_of_dpm_2m_is_ddim():
+def test_first_step_of_dpm_2m_equals_ddim():
     first, second = (
         [out for _, _, out in _record(0, kernel=kernel)[2]] for kernel in (ddim, dpmpp_2m)
     )
@@ -183,8 +190,10 @@ def test_the_first_step_of_dpm_2m_is_ddim():
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), i=st.integers(2, 49))
-def test_dpm_2m_is_the_printed_update(seed, i):
-    """x_{t-1} = sigma_b / sigma_a x - alpha_b (e^-h - 1) D, D = (1 + 1 / 2r) x0 - x0_before / 2r, r = h_before / h."""
+def test_dpm_2m_equals_the_printed_update(seed, i):
+    """x_{t-1} = sigma_b / sigma_a x - alpha_b (e^-h - 1) D, D = (1 + 1 / 2r) x0 - x0_before / 2r, r
+    = h_before / h.
+    """
     a_before, a, b = (Schedule.cosine(50).alpha_bar[k] for k in (i + 1, i, i - 1))
     x, x0, before = normal(seed, 1, 2, 2), normal(seed + 1, 1, 2, 2), normal(seed + 2, 1, 2, 2)
     log_snr = [math.log(math.sqrt(level / (1 - level))) for level in (a_before, a, b)]
@@ -245,7 +254,7 @@ def test_shorter_steps_near_the_data_are_closer_to_a_narrow_law_than_even_ones(k
     )
 
 
-# the loop -------------------------------------------------------------------------------------------------------------
+# the loop -----------------------------------------------------------------------------------------
 
 
 def _record(extra_steps, method=None, kernel=ddpm, b=0.2, n_steps=12):
@@ -285,12 +294,12 @@ def test_only_steps_at_t_one_are_without_noise():
     assert [step.last for _, step, _ in seen] == [False] * 11 + [True] * 4
 
 
-def test_on_step_sees_the_plan_that_is_returned():
+def test_on_step_gets_the_returned_plan_last():
     x, _, seen = _record(2)
     assert torch.equal(seen[-1][2], x)
 
 
-def test_frozen_steps_let_the_multipliers_finish():
+def test_frozen_steps_let_the_multipliers_converge():
     def violation(extra_steps):
         return float(
             waypoints(half_space())(_record(extra_steps, CleanAugmentedLagrangian(rho=0.1))[0])
@@ -333,7 +342,7 @@ def test_pins_hold_exactly_at_every_step(kernel, method):
 @pytest.mark.parametrize(
     "method", [CleanProjected(), CleanPrimalDual(), CleanAugmentedLagrangian()]
 )
-def test_the_next_step_knows_the_estimate_that_was_used_not_the_network_s(method):
+def test_kernel_gets_the_estimate_that_the_previous_step_used(method):
     given = []
 
     def kernel(x, x0, z, a, b, previous):
@@ -354,7 +363,7 @@ def test_the_next_step_knows_the_estimate_that_was_used_not_the_network_s(method
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 12])
-def test_frozen_steps_of_dpm_2m_are_clean_estimates_that_obey(n_steps):
+def test_frozen_steps_of_dpm_2m_return_safe_clean_estimates(n_steps):
     g = waypoints(half_space(b=-0.3))
     _, calls, seen = _record(3, CleanProjected(), dpmpp_2m, b=-0.3, n_steps=n_steps)
     assert len(calls) == n_steps + 3
@@ -366,7 +375,7 @@ def test_frozen_steps_of_dpm_2m_are_clean_estimates_that_obey(n_steps):
 
 
 @pytest.mark.parametrize("kernel", [ddim, dpmpp_2m])
-def test_deterministic_kernels_need_no_noise_but_the_first(kernel):
+def test_deterministic_kernels_use_only_the_first_noise(kernel):
     schedule, pins = Schedule.cosine(10), Pins.none(torch.zeros(1, 1, 1, dtype=F64))
     first = normal(0, 1, 1, 1)
     outs = []
@@ -391,7 +400,7 @@ def _first_then(first, later):
     return lambda: queue.pop() if queue else later()
 
 
-def test_a_chain_split_in_two_with_the_state_handed_on_is_the_whole_chain():
+def test_sampling_resumed_from_a_state_equals_sampling_at_once():
     """Frozen steps alone: 3 + 4 of them, begun where the first 3 ended, are 7."""
     schedule, like = Schedule.cosine(1), torch.zeros(2, 3, 2, dtype=F64)
     denoiser = gaussian_denoiser(schedule, MEAN, STD)
@@ -418,16 +427,16 @@ def test_a_chain_split_in_two_with_the_state_handed_on_is_the_whole_chain():
     assert not torch.equal(go(half.x, 3).x, whole.x)
 
 
-# noise ----------------------------------------------------------------------------------------------------------------
+# noise --------------------------------------------------------------------------------------------
 
 
-def test_the_draws_of_a_seed_do_not_depend_on_its_neighbours():
+def test_noise_of_a_seed_does_not_depend_on_other_seeds():
     alone, among = Noise([7], (3, 2)), Noise([1, 7, 4], (3, 2))
     for _ in range(3):
         assert torch.equal(alone()[0], among()[1])
 
 
-def test_the_plan_of_a_seed_does_not_depend_on_its_neighbours():
+def test_plan_of_a_seed_does_not_depend_on_other_seeds():
     schedule = Schedule.cosine(10)
 
     def plans(seeds):
@@ -455,7 +464,7 @@ def test_noise_is_standard_normal():
     assert float(x.std()) == pytest.approx(1, abs=0.03)
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 
 class _Constant(nn.Module):

@@ -1,4 +1,4 @@
-"""Ball run: SafetyBallRun's physics to the golden numbers, the obstacle's six patterns, contact, demonstrations."""
+"""Ball run: SafetyBallRun's physics, the six patterns of the obstacle, contact, demonstrations."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ SEEDS = range(5)
 
 
 def run(env, seed, steps=100, throttle=0.35):
-    """Balls' states [steps + 1, 4] each, and the last info, of an agent that keeps to y = 0 at about 4 m/s."""
+    """States of ball and obstacle [steps + 1, 4], and the last info, at about 4 m/s along y = 0."""
     obs, info = env.reset(seed=seed)
     ball, obstacle = [BALL_RUN.observe(obs)], [list(BALL_RUN.observed(env).values())]
     for _ in range(steps):
@@ -41,7 +41,7 @@ def distance(ball, obstacle):
 
 
 def trace(seed=3, pattern="chaser"):
-    """sha256 of every observation of an episode: equal only where the runs are equal to the bit."""
+    """sha256 of every observation of an episode: equal only if the runs are equal to the bit."""
     env = BallRunEnv(pattern)
     obs, _ = env.reset(seed=seed)
     rng, sha = np.random.default_rng(seed), hashlib.sha256(obs.tobytes())
@@ -61,7 +61,7 @@ def test_physics_and_reward_are_those_of_safety_ball_run():
         seen.append(obs)
         rewards.append(reward)
     golden = np.array(GOLDEN["observations"])
-    # one pybullet, one machine: equal to the last digit stored; 1e-4 leaves room for another compiler
+    # one pybullet on one machine gives equal digits; 1e-4 allows for another compiler
     np.testing.assert_allclose(
         BALL_RUN.observe(np.array(seen)), BALL_RUN.observe(golden), atol=1e-4
     )
@@ -72,7 +72,7 @@ def test_physics_and_reward_are_those_of_safety_ball_run():
 @pytest.mark.parametrize(
     "options", [{}, {"pattern": "leader", "collide": False}, {"pattern": "none"}], ids=str
 )
-def test_gymnasium_finds_no_fault_with_it(options):
+def test_environment_passes_gymnasiums_checker(options):
     from gymnasium.utils.env_checker import check_env
 
     env = gymnasium.make(ENV_ID, render_mode="rgb_array", **options)
@@ -82,7 +82,7 @@ def test_gymnasium_finds_no_fault_with_it(options):
     env.close()
 
 
-def test_an_episode_ends_after_100_steps_by_truncation():
+def test_episode_is_truncated_after_100_steps():
     env = BALL_RUN.make_env()
     env.reset(seed=0)
     ends = [env.step(np.ones(2, dtype=np.float32))[2:4] for _ in range(100)]
@@ -90,7 +90,7 @@ def test_an_episode_ends_after_100_steps_by_truncation():
 
 
 def python(code):
-    """What a fresh process that runs the code returns: status, output, errors."""
+    """Status, output and errors of a new process that runs the code."""
     paths = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -103,7 +103,7 @@ def python(code):
     return done.returncode, done.stdout, done.stderr
 
 
-def test_two_processes_play_the_same_episode_to_the_bit():
+def test_two_processes_get_the_same_episode_to_the_bit():
     assert python("from tests.tasks.test_ball_run import trace; print(trace(), end='')") == (
         0,
         trace(),
@@ -111,18 +111,18 @@ def test_two_processes_play_the_same_episode_to_the_bit():
     )
 
 
-def test_importing_it_prints_nothing():
+def test_importing_the_environment_prints_nothing():
     assert python("import cdiff_cli.tasks.ball_run.env as b; b.BallRunEnv().close()") == (0, "", "")
 
 
-def test_an_episode_does_not_depend_on_the_ones_before():
+def test_episode_does_not_depend_on_earlier_episodes():
     env = BallRunEnv("oncoming")
     first = run(env, 1)
     run(env, 2)
     np.testing.assert_array_equal(run(env, 1)[0], first[0])
 
 
-def test_the_seed_names_the_pattern_unless_one_is_given():
+def test_seed_sets_the_pattern_unless_one_is_given():
     env = BallRunEnv()
     assert [env.reset(seed=seed)[1]["pattern"] for seed in range(12)] == 2 * list(PATTERNS)
     assert env.reset()[1]["pattern"] in PATTERNS
@@ -130,7 +130,7 @@ def test_the_seed_names_the_pattern_unless_one_is_given():
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_the_velocity_reported_is_the_one_it_moves_by(pattern):
+def test_obstacle_moves_by_its_observed_velocity(pattern):
     _, obstacle, _ = run(BallRunEnv(pattern), 4)
     moved = np.diff(obstacle[:, :2], axis=0) / DT
     np.testing.assert_allclose(
@@ -142,13 +142,13 @@ def test_the_velocity_reported_is_the_one_it_moves_by(pattern):
 
 
 @pytest.mark.parametrize("pattern", ["random-waypoint", "chaser"])
-def test_patterns_that_steer_have_bounded_acceleration(pattern):
+def test_steering_patterns_have_bounded_acceleration(pattern):
     _, obstacle, _ = run(BallRunEnv(pattern), 4)
     assert np.linalg.norm(np.diff(obstacle[:, 2:], axis=0), axis=1).max() < ACCELERATION * DT + 1e-9
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_each_pattern_moves_as_named(seed):
+def test_pattern_moves_as_its_name_says(seed):
     o = {name: run(BallRunEnv(name, collide=False), seed) for name in PATTERNS}
     assert (o["oncoming"][1][:, 2] < 0).all()
     assert o["oncoming"][1][0, 0] > 5
@@ -169,14 +169,14 @@ def test_each_pattern_moves_as_named(seed):
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_nobody_begins_in_danger_and_someone_who_does_not_look_meets_it(pattern):
+def test_obstacle_starts_away_from_the_ball_and_meets_one_that_ignores_it(pattern):
     env = BallRunEnv(pattern, collide=False)
     gaps = [distance(*run(env, seed)[:2]) for seed in SEEDS]
     assert min(gap[0] for gap in gaps) > 2.0
     assert min(gap.min() for gap in gaps) < 1.2
 
 
-def test_contact_is_counted_where_balls_are_solid_and_a_ghost_is_run_through():
+def test_contacts_are_counted_with_solid_balls_and_not_with_a_ghost():
     block = {"start": (0.0, 0.0), "obstacle": (1.5, 0.0, 0.0, 0.0)}
     ends = {}
     for collide in (True, False):
@@ -190,13 +190,13 @@ def test_contact_is_counted_where_balls_are_solid_and_a_ghost_is_run_through():
         )
     assert (
         ends[True][0] < 1.5 - 2 * RADIUS + 0.05
-    )  # stopped where they touch; a few centimetres of overlap in a substep
+    )  # the balls stop at contact, with a few centimetres of overlap in a substep
     assert ends[True][1] == ends[True][2] > 0
     assert ends[False][0] > 3.0
     assert ends[False][1] == 0
 
 
-def test_a_ball_that_is_run_into_is_pushed_along():
+def test_ball_hit_by_the_obstacle_is_pushed():
     env = BallRunEnv("oncoming")
     env.reset(seed=0, options={"obstacle": (-1.5, 0.0, 3.0, 0.0)})
     for _ in range(60):
@@ -205,12 +205,12 @@ def test_a_ball_that_is_run_into_is_pushed_along():
     assert info["contacts"] > 20
     np.testing.assert_allclose(
         o, [-1.5 + 60 * DT * 3.0, 0.0, 3.0, 0.0], atol=1e-9
-    )  # it yields to nothing
-    assert x[2] == pytest.approx(3.0, abs=0.05)  # m/s: pushed along, no longer bouncing
+    )  # the ball does not deflect it
+    assert x[2] == pytest.approx(3.0, abs=0.05)  # m/s, the speed of the obstacle
     assert np.hypot(*(x - o)[:2]) == pytest.approx(2 * RADIUS, abs=0.01)
 
 
-def test_the_picture_shows_both_balls():
+def test_picture_shows_both_balls():
     env = BALL_RUN.make_env(render=True, pattern="leader")
     env.reset(seed=0)
     picture = env.render().astype(int)
@@ -221,7 +221,7 @@ def test_the_picture_shows_both_balls():
     env.close()
 
 
-def test_observed_quantities_are_those_of_the_contract():
+def test_environment_reports_the_observable_quantities():
     env = BALL_RUN.make_env(pattern="circling")
     obs, _ = env.reset(seed=0)
     seen = BALL_RUN.observed(env)
@@ -230,7 +230,7 @@ def test_observed_quantities_are_those_of_the_contract():
     assert BALL_RUN.observed(BALL_RUN.make_env(pattern="none")) == {}
 
 
-def test_an_unknown_pattern_is_refused_with_the_known_ones():
+def test_unknown_pattern_error_lists_the_known_ones():
     with pytest.raises(CdiffError, match=r'no pattern "chasr".*chaser'):
         BallRunEnv("chasr")
 

@@ -1,4 +1,4 @@
-"""Hopper and Swimmer: layout against MuJoCo, shipped gaits, demonstrations, the search for gaits."""
+"""Hopper and Swimmer: layout in MuJoCo, shipped gaits, demonstrations, search for gaits."""
 
 import json
 from dataclasses import replace
@@ -23,7 +23,7 @@ each_task = pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
 HORIZON = 16
 ROOT = Path(__file__).parents[2]
 RETURN = {"hopper": 3150.0, "swimmer": 340.0}
-"""What an expert reaches at least, mean over 20 fresh seeds."""
+"""Least mean return of an expert over 20 new seeds."""
 
 
 @pytest.fixture(scope="module", params=TASKS, ids=lambda task: task.name)
@@ -31,11 +31,11 @@ def demonstrated(request):
     return request.param, list(request.param.demonstrate(5000, 1))
 
 
-# the environments -----------------------------------------------------------------------------------------------------
+# the environments ---------------------------------------------------------------------------------
 
 
 @each_task
-def test_the_layout_is_the_environments_own(task):
+def test_layout_is_that_of_the_environment(task):
     env = task.make_env()
     own = env.unwrapped
     obs, _ = env.reset(seed=0)
@@ -49,28 +49,28 @@ def test_the_layout_is_the_environments_own(task):
     )
     at, first = {"hopper": (8, "thigh_joint"), "swimmer": (7, "motor2_rot")}[task.name]
     assert task.layout[at] == {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}[task.name]
-    assert joints[at - len(task.layout)] == first  # velocities come last, one a joint
+    assert joints[at - len(task.layout)] == first  # velocities come last, one per joint
 
 
 @each_task
-def test_an_episode_of_observations_is_observed_at_once(task):
+def test_episode_of_observations_equals_its_single_observations(task):
     rows = np.arange(3.0 * len(task.layout), dtype=np.float32).reshape(3, -1)
     assert task.observe(rows).dtype == np.float64
     assert np.array_equal(task.observe(rows), np.stack([task.observe(row) for row in rows]))
 
 
-def test_nothing_is_observed_around_a_walker_and_nothing_stands_in_its_way():
+def test_locomotion_has_no_observed_quantities_and_no_walls():
     env = SWIMMER.make_env()
     assert observed_in(SWIMMER, env) == {}
     env.close()
     assert walls_of(SWIMMER).shape == (0, 4)
 
 
-# the shipped gaits ----------------------------------------------------------------------------------------------------
+# the shipped gaits --------------------------------------------------------------------------------
 
 
 @each_task
-def test_the_shipped_gaits_reach_their_return_without_a_fall(task):
+def test_shipped_gaits_reach_their_return_without_a_fall(task):
     env = task.make_env().unwrapped
     for gait in task.experts():
         outs = [task.walk(env, gait, seed) for seed in (30_000, 30_001)]
@@ -81,7 +81,7 @@ def test_the_shipped_gaits_reach_their_return_without_a_fall(task):
 
 
 @each_task
-def test_the_returns_written_down_are_those_asked_for(task):
+def test_recorded_returns_reach_the_required_levels(task):
     path = ROOT / "models" / task.name / "expert.json"
     policies = json.loads(path.read_text())["policies"]
     assert len({policy["seed"] for policy in policies}) == len(policies) >= 2  # several gaits
@@ -94,7 +94,7 @@ def test_the_returns_written_down_are_those_asked_for(task):
 
 
 @each_task
-def test_a_return_written_down_is_what_its_episode_gives(task):
+def test_recorded_return_is_reproduced_by_its_episodes(task):
     path = ROOT / "models" / task.name / "expert.json"
     policy = json.loads(path.read_text())["policies"][0]
     least = policy["returns"][0]
@@ -103,7 +103,7 @@ def test_a_return_written_down_is_what_its_episode_gives(task):
     assert again["mean"] == pytest.approx(least["mean"], abs=4 * least["sd"] + 1)
 
 
-def test_a_hopper_that_stands_still_falls():
+def test_hopper_without_input_falls():
     env = HOPPER.make_env().unwrapped
     out = HOPPER.walk(env, Gait(np.zeros((3, 11)), np.zeros(3)), 0)
     assert out.fell
@@ -122,7 +122,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_gaits_that_cannot_be_read_say_how_to_search_them(case, tmp_path, monkeypatch):
+def test_unreadable_gaits_error_names_the_search_command(case, tmp_path, monkeypatch):
     text, said = BAD[case]
     (tmp_path / "models" / "swimmer").mkdir(parents=True)
     (tmp_path / "constraints").mkdir()
@@ -134,10 +134,10 @@ def test_gaits_that_cannot_be_read_say_how_to_search_them(case, tmp_path, monkey
     assert str(caught.value).startswith("models/swimmer/expert.json: ")
 
 
-# demonstrations -------------------------------------------------------------------------------------------------------
+# demonstrations -----------------------------------------------------------------------------------
 
 
-def test_demonstrations_have_exactly_the_steps_asked_for(demonstrated):
+def test_demonstrations_have_exactly_the_requested_steps(demonstrated):
     _, episodes = demonstrated
     assert sum(len(episode["actions"]) for episode in episodes) == 5000
     for episode in episodes:
@@ -149,17 +149,17 @@ def test_demonstrations_have_exactly_the_steps_asked_for(demonstrated):
         )
 
 
-def test_most_steps_lie_in_windows_and_a_tenth_are_branches(demonstrated):
+def test_most_steps_are_in_windows_and_a_tenth_in_branches(demonstrated):
     _, episodes = demonstrated
     lengths = np.array([len(episode["actions"]) for episode in episodes])
     short = lengths[lengths + 1 < HORIZON].sum() / lengths.sum()
     assert (
         BRANCH_SHARE - 0.03 < short < BRANCH_SHARE + 0.12
-    )  # the last walk's branches may be cut off; bursts come on top
+    )  # the branches of the last walk may be cut off; bursts come on top
 
 
 @pytest.mark.parametrize(("suffix", "share"), [("", 0.05), ("-hard", 0.1)])
-def test_the_shipped_limits_are_the_stated_quantiles_of_the_walks(demonstrated, suffix, share):
+def test_shipped_limits_are_the_stated_quantiles_of_the_walks(demonstrated, suffix, share):
     task, episodes = demonstrated
     kinds, _ = load_constraints(
         ROOT / "constraints" / f"{task.name}{suffix}.yaml", task.name, task.layout
@@ -182,14 +182,12 @@ def test_recorded_actions_are_clipped_and_reproduce_the_recorded_states(demonstr
     env, q = (
         task.make_env().unwrapped,
         {"hopper": 5, "swimmer": 3}[task.name],
-    )  # so many coordinates are joint positions
+    )  # number of coordinates that are joint positions
     env.reset(seed=0)
     for before, u, after in (tuple(e[k][i] for k, i in STEP) for e in episodes[::50]):
-        if (
-            np.abs(before).max() < 10
-        ):  # where Hopper clips its observed velocities the state is not known
+        if np.abs(before).max() < 10:  # the state is unknown where Hopper clips its velocities
             env.set_state(np.concatenate((env.data.qpos[:-q], before[:q])), before[q:])
-            # contact forces start from the last step's; the solver's tolerance then shows at 1e-3 rad/s
+            # contact forces start from the last step's, to the solver's tolerance: 1e-3 rad/s
             assert env.step(u)[0] == pytest.approx(after, abs=2e-2)
 
 
@@ -205,7 +203,7 @@ def test_demonstrations_repeat_with_their_seed(task):
     assert not np.array_equal(np.concatenate(first), np.concatenate(other))
 
 
-def test_the_gaits_take_turns_each_with_bursts_and_without(monkeypatch):
+def test_gaits_alternate_with_and_without_bursts(monkeypatch):
     gaits = [Gait(np.zeros((2, 8)), np.full(2, b)) for b in (-0.5, 0.5)]
     monkeypatch.setattr(type(SWIMMER), "experts", lambda _: gaits)
     task = replace(SWIMMER, noise={0.0: 1.0}, max_steps=300)
@@ -220,10 +218,10 @@ def test_the_gaits_take_turns_each_with_bursts_and_without(monkeypatch):
     steps = [sum(len(u) for u in walked if u[0, 0] == b) for b in (-0.5, 0.5)]
     assert steps[0] / sum(steps) == pytest.approx(
         0.5, abs=0.1
-    )  # a turn broken off leaves two of about 14 walks over
+    )  # an unfinished turn leaves two of about 14 walks over
 
 
-def test_gaits_that_are_not_named_are_not_demonstrated(monkeypatch):
+def test_only_the_named_gaits_are_demonstrated(monkeypatch):
     monkeypatch.setattr(
         type(SWIMMER),
         "experts",
@@ -235,14 +233,14 @@ def test_gaits_that_are_not_named_are_not_demonstrated(monkeypatch):
             assert (np.stack(episode["actions"]) == 0.5).all()
 
 
-def test_a_fall_never_ends_a_window(monkeypatch):
+def test_no_window_ends_in_a_fall(monkeypatch):
     monkeypatch.setattr(type(HOPPER), "experts", lambda _: [Gait(np.zeros((3, 11)), np.zeros(3))])
     monkeypatch.setattr(locomotion, "BURST_EVERY", np.inf)  # a burst would cut the fall in two
     episodes = list(HOPPER.demonstrate(1000, 0))
     assert max(len(episode["observations"]) for episode in episodes) < HORIZON
 
 
-def test_demonstrations_travel_through_minari_as_plain_observations(tmp_path, monkeypatch):
+def test_minari_returns_the_demonstrated_observations(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     stored = demonstrations(SWIMMER, 1200, 0)
     made = list(SWIMMER.demonstrate(1200, 0))
@@ -258,12 +256,12 @@ def test_demonstrations_travel_through_minari_as_plain_observations(tmp_path, mo
         load_dataset(UMAZE, "cdiff/swimmer-v0")
 
 
-# the search -----------------------------------------------------------------------------------------------------------
+# the search ---------------------------------------------------------------------------------------
 
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(1, 39), max_size=4))
-def test_whitening_in_pieces_is_the_mean_and_deviation_of_all(seed, cuts):
+def test_whitening_in_batches_equals_mean_and_deviation_of_all_data(seed, cuts):
     seen = np.random.default_rng(seed).normal(3.0, [1.0, 10.0], (40, 2))
     whitening = Whitening(2)
     for piece in np.split(seen, sorted(set(cuts))):
@@ -272,7 +270,7 @@ def test_whitening_in_pieces_is_the_mean_and_deviation_of_all(seed, cuts):
     assert whitening.deviation() == pytest.approx(seen.std(0), abs=1e-7)
 
 
-def test_the_folded_gait_is_the_policy_of_whitened_observations():
+def test_folded_gait_equals_the_policy_on_whitened_observations():
     rng = np.random.default_rng(0)
     whitening = Whitening(3)
     whitening.add(rng.normal(2.0, 3.0, (50, 3)))
@@ -282,7 +280,7 @@ def test_the_folded_gait_is_the_policy_of_whitened_observations():
     )
 
 
-def test_a_gait_clips_its_inputs():
+def test_gait_clips_its_inputs():
     assert Gait(np.array([[10.0], [-10.0], [0.5]]), np.zeros(3))(np.ones(1)).tolist() == [
         1.0,
         -1.0,
@@ -294,7 +292,7 @@ TINY = replace(SEARCHES["swimmer"], at_least=-1e9).within(12_000)
 BRIEF = replace(SWIMMER, max_steps=200)
 
 
-def test_a_tiny_search_improves_and_repeats_with_its_seed():
+def test_tiny_search_improves_and_repeats_with_its_seed():
     first, again = search_gait(BRIEF, TINY, 0), search_gait(BRIEF, TINY, 0)
     assert first is not None
     assert again is not None
@@ -306,11 +304,11 @@ def test_a_tiny_search_improves_and_repeats_with_its_seed():
     assert np.array_equal(gait.b, again[0].b)
 
 
-def test_a_seed_below_the_screen_is_given_up():
+def test_seed_below_the_screen_is_given_up():
     assert search_gait(BRIEF, replace(TINY, at_least=1e9), 0) is None
 
 
-def test_the_search_writes_what_the_task_reads(tmp_path, monkeypatch, capsys):
+def test_search_writes_a_file_that_the_task_reads(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gait_search, "load_task", lambda _: BRIEF)
     monkeypatch.setitem(SEARCHES, "swimmer", TINY)
     out = tmp_path / "models" / "swimmer" / "expert.json"

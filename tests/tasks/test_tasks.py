@@ -1,4 +1,4 @@
-"""The environments: geometry against Gymnasium-Robotics, demonstrations that touch no wall, an exact denoiser."""
+"""Mazes and Gaussian: geometry in Gymnasium-Robotics, demonstrations, the exact denoiser."""
 
 import math
 from itertools import pairwise
@@ -28,11 +28,11 @@ def clearance(maze: Maze2D, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(nearest - points[:, None], axis=2).min(1)
 
 
-# the table ------------------------------------------------------------------------------------------------------------
+# the table ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_every_task_names_and_measures_its_coordinates(name):
+def test_every_task_has_names_and_units_for_its_coordinates(name):
     task = load_task(name)
     assert task.name == name
     assert len(task.layout) == len(task.units) == len(set(task.layout))
@@ -43,7 +43,7 @@ def test_every_task_names_and_measures_its_coordinates(name):
     assert walls_of(task).shape[1] == 4
 
 
-def test_an_unknown_task_is_answered_with_the_closest_and_with_all():
+def test_unknown_task_error_names_the_closest_and_lists_all():
     with pytest.raises(CdiffError) as caught:
         load_task("maze2d-umase")
     assert str(
@@ -51,11 +51,11 @@ def test_an_unknown_task_is_answered_with_the_closest_and_with_all():
     ) == 'no task "maze2d-umase" (did you mean "maze2d-umaze"?); choose from ' + ", ".join(TASKS)
 
 
-# the mazes ------------------------------------------------------------------------------------------------------------
+# the mazes ----------------------------------------------------------------------------------------
 
 
 @each_maze
-def test_the_map_the_centres_and_the_time_step_are_gymnasium_robotics_own(maze):
+def test_map_centres_and_time_step_equal_gymnasium_robotics(maze):
     env = maze.make_env()
     try:
         own = env.unwrapped
@@ -102,7 +102,7 @@ def test_is_free_by_hand():
 @each_maze
 @settings(max_examples=30, deadline=None)
 @given(x=st.floats(-7, 7), y=st.floats(-6, 6))
-def test_a_point_is_free_where_its_cell_is(maze, x, y):
+def test_point_is_free_if_its_cell_is(maze, x, y):
     row, col = maze.cell(np.array([x, y]))
     inside = 0 <= row < len(maze.rows) and 0 <= col < len(maze.rows[0])
     if maze.is_free(np.array([x, y])):
@@ -110,20 +110,20 @@ def test_a_point_is_free_where_its_cell_is(maze, x, y):
         assert maze.rows[row][col] == " "
 
 
-def test_the_shortest_route_round_the_u_is_known():
+def test_shortest_route_around_the_u_is_known():
     route = UMAZE.route(UMAZE.centre((3, 1)), UMAZE.centre((1, 1)))
     assert route == [(3, 1), (3, 2), (3, 3), (2, 3), (1, 3), (1, 2), (1, 1)]
     assert UMAZE.path_length(UMAZE.centre((3, 1)), UMAZE.centre((1, 1))) == pytest.approx(6.0)
 
 
-def test_a_route_into_a_wall_is_refused():
+def test_route_into_a_wall_is_refused():
     with pytest.raises(
         CdiffError, match=r"no route in maze2d-umaze: the point \(-2, 0\) lies in a wall"
     ):
         UMAZE.route(UMAZE.centre((3, 1)), np.array([-2.0, 0.0]))
 
 
-def test_a_route_takes_the_cheaper_way_round():
+def test_route_takes_the_cheaper_way():
     start, goal = LARGE.centre((1, 1)), LARGE.centre((3, 4))
     short = LARGE.route(start, goal)
     assert len(short) == 6
@@ -134,7 +134,7 @@ def test_a_route_takes_the_cheaper_way_round():
 @each_maze
 @settings(max_examples=20, deadline=None)
 @given(data=st.data())
-def test_routes_walk_over_free_neighbours_and_are_as_long_both_ways(maze, data):
+def test_routes_step_between_free_neighbours_and_have_equal_length_both_ways(maze, data):
     free = st.sampled_from(maze.cells(" "))
     start, goal = (maze.centre(data.draw(free)) for _ in range(2))
     route = maze.route(start, goal)
@@ -147,7 +147,7 @@ def test_routes_walk_over_free_neighbours_and_are_as_long_both_ways(maze, data):
 
 
 @each_maze
-def test_random_points_keep_clear_of_the_walls(maze):
+def test_random_points_are_clear_of_the_walls(maze):
     rng = np.random.default_rng(0)
     points = np.array([maze.random_point(rng) for _ in range(200)])
     assert (
@@ -160,7 +160,7 @@ def demonstrated(request):
     return request.param, list(request.param.demonstrate(3000, 1))
 
 
-def test_demonstrations_have_the_steps_asked_for(demonstrated):
+def test_demonstrations_have_the_requested_steps(demonstrated):
     maze, episodes = demonstrated
     assert [len(episode["actions"]) for episode in episodes] == [2000, 1000]
     assert [len(maze.observe(episode["observations"][0])) for episode in episodes] == [4, 4]
@@ -174,7 +174,7 @@ def test_demonstrations_never_touch_a_wall(demonstrated):
         assert clearance(maze, states[:, :2]).min() > BALL_RADIUS
 
 
-def test_demonstrated_forces_and_speeds_are_within_the_environments_bounds(demonstrated):
+def test_demonstrated_forces_and_speeds_are_within_the_bounds_of_the_environment(demonstrated):
     maze, episodes = demonstrated
     for episode in episodes:
         assert np.abs(np.stack(episode["actions"])).max() <= 1.0
@@ -184,7 +184,7 @@ def test_demonstrated_forces_and_speeds_are_within_the_environments_bounds(demon
         )  # MuJoCo clips before it integrates the last force
 
 
-def test_trips_begin_and_end_at_rest(demonstrated):
+def test_trips_start_and_end_at_rest(demonstrated):
     maze, episodes = demonstrated
     ends, misses = [], []
     for episode in episodes:
@@ -197,8 +197,8 @@ def test_trips_begin_and_end_at_rest(demonstrated):
         ends += np.linalg.norm(states[last, 2:], axis=1).tolist()
         misses += np.linalg.norm(goals[last] - states[last, :2], axis=1).tolist()
     assert len(ends) >= 3
-    assert max(misses) < 0.08  # the trip's own test of having arrived
-    assert np.median(ends) < 0.06 * MAX_SPEED  # what Windows.favour_trips counts as rest
+    assert max(misses) < 0.08  # m, distance at which a trip has arrived
+    assert np.median(ends) < 0.06 * MAX_SPEED  # limit of rest in Windows.favour_trips
 
 
 def test_demonstrations_repeat_with_their_seed():
@@ -207,7 +207,7 @@ def test_demonstrations_repeat_with_their_seed():
     assert not np.array_equal(np.stack(first), np.stack(other))
 
 
-def test_reset_puts_ball_and_goal_where_they_were_asked():
+def test_reset_places_ball_and_goal():
     env = UMAZE.make_env()
     state, goal = np.array([0.3, -1.1, 0.5, -0.25]), np.array([0.1, 0.9, 0.0, 0.0])
     obs = UMAZE.reset_to(env.unwrapped, state, goal, seed=0)
@@ -216,17 +216,17 @@ def test_reset_puts_ball_and_goal_where_they_were_asked():
     assert obs["desired_goal"] == pytest.approx(goal[:2])
 
 
-def test_the_tracking_force_is_that_of_a_clipped_pd_controller():
+def test_tracking_force_is_a_clipped_pd_controller():
     force = UMAZE.track(np.zeros(4), np.array([0.01, -9.0, 0.1, 0.0]))
     assert force == pytest.approx([20 * 0.01 + 2 * 0.1, -1.0])
 
 
-def test_d4rl_states_turn_into_this_frame():
+def test_d4rl_states_are_converted_to_the_coordinates_of_the_task():
     state = LARGE.from_d4rl(np.array([[0.949, 2.936, 0.5, -1.5]]))
     assert state[0] == pytest.approx([-2.364, 2.851, -1.5, -0.5])
 
 
-# the gaussian ---------------------------------------------------------------------------------------------------------
+# the gaussian -------------------------------------------------------------------------------------
 
 
 def test_covariance_has_the_stated_axes():
@@ -237,12 +237,13 @@ def test_covariance_has_the_stated_axes():
 
 @settings(max_examples=30, deadline=None)
 @given(x=st.floats(-5, 5), y=st.floats(-5, 5), i=st.integers(1, 49))
-def test_the_denoiser_is_the_analytic_posterior_mean(x, y, i):
+def test_denoiser_is_the_analytic_posterior_mean(x, y, i):
     schedule = Schedule.cosine(50)
     a, t = schedule.alpha_bar[i], schedule.t[i]
     noisy = torch.tensor([[[x, y]]], dtype=torch.float64)
     precision = torch.linalg.inv(GAUSSIAN2D.covariance() / GAUSSIAN2D.scale**2)
-    # prior N(0, S), likelihood N(x_t; sqrt(a) x_0, (1 - a) I): (S^-1 + a / (1 - a) I) mean = sqrt(a) / (1 - a) x_t
+    # prior N(0, S), likelihood N(x_t; sqrt(a) x_0, (1 - a) I):
+    # (S^-1 + a / (1 - a) I) mean = sqrt(a) / (1 - a) x_t
     posterior = torch.linalg.solve(
         precision + a / (1 - a) * torch.eye(2, dtype=torch.float64),
         math.sqrt(a) / (1 - a) * noisy[0, 0],
@@ -250,7 +251,7 @@ def test_the_denoiser_is_the_analytic_posterior_mean(x, y, i):
     assert torch.allclose(GAUSSIAN2D.denoiser(schedule)(noisy, t)[0, 0], posterior, atol=1e-9)
 
 
-def test_the_denoiser_keeps_a_clean_point():
+def test_denoiser_leaves_a_clean_point_unchanged():
     x = torch.tensor([[[0.3, -1.2]]], dtype=torch.float64)
     assert torch.allclose(GAUSSIAN2D.denoiser(Schedule.cosine(10))(x, 0), x)
 
@@ -262,7 +263,7 @@ def test_exact_samples_have_the_covariance():
     )  # 4 standard errors of a variance of 2
 
 
-def test_the_gaussian_is_neither_trained_nor_rolled_out():
+def test_gaussian_is_neither_trained_nor_rolled_out():
     with pytest.raises(CdiffError, match="its score is exact"):
         demonstrations(GAUSSIAN2D, 10, 0)
     with pytest.raises(CdiffError, match="not an environment"):

@@ -33,7 +33,7 @@ def states(seed: int, n: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(0.0, [1.0, 5.0, 0.1, 3.0], (n, 4))
 
 
-# normaliser -----------------------------------------------------------------------------------------------------------
+# normaliser ---------------------------------------------------------------------------------------
 
 
 def test_normaliser_by_hand():
@@ -46,12 +46,12 @@ def test_normaliser_by_hand():
     ]
 
 
-def test_without_shared_groups_every_coordinate_fills_its_range():
+def test_coordinates_without_shared_groups_fill_their_range():
     z = Normaliser.fit(STATES, LAYOUT, ()).encode(torch.from_numpy(STATES))
     assert z.tolist() == [[-1.0] * 4, [1.0] * 4]
 
 
-def test_a_constant_coordinate_does_not_divide_by_zero():
+def test_constant_coordinate_does_not_divide_by_zero():
     z = Normaliser.fit(np.ones((3, 1)), ("x",), ()).encode(torch.ones(3, 1))
     assert z.tolist() == [[0.0]] * 3
 
@@ -73,7 +73,7 @@ def test_decode_undoes_encode(seed, n):
 
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10_000), n=st.integers(2, 20))
-def test_data_lies_within_one_and_a_ball_stays_a_ball(seed, n):
+def test_encoded_data_is_within_one_and_a_ball_stays_a_ball(seed, n):
     x = states(seed, n)
     normaliser = Normaliser.fit(x, LAYOUT, SHARED)
     assert normaliser.encode(torch.from_numpy(x)).abs().max() <= 1 + 1e-9
@@ -89,7 +89,7 @@ def test_encoding_keeps_the_dtype():
     assert Normaliser.fit(STATES, LAYOUT, SHARED).encode(torch.zeros(1, 4)).dtype == torch.float32
 
 
-# windows --------------------------------------------------------------------------------------------------------------
+# windows ------------------------------------------------------------------------------------------
 
 
 def numbered(*lengths: int) -> list[np.ndarray]:
@@ -123,7 +123,7 @@ def test_no_window_crosses_the_border_of_an_episode(lengths, horizon, seed):
     assert (drawn[:, :, 1].diff(dim=1) == 1).all()
 
 
-def test_windows_of_no_episodes_say_so():
+def test_windows_without_episodes_are_an_error():
     with pytest.raises(CdiffError, match="longest of 0 episodes has 0 states"):
         Windows.from_episodes([], 3)
 
@@ -144,7 +144,7 @@ def probabilities(windows: Windows) -> torch.Tensor:
     return torch.diff(windows.cumulative, prepend=torch.zeros(1, dtype=torch.float64))
 
 
-def test_favoured_trips_get_their_share_in_proportion_to_their_length():
+def test_favoured_trips_get_their_share_by_length():
     uniform = Windows.from_episodes([trip()], 14)
     windows = uniform.favour_trips(0.5, [0], [1])
     ends = windows[torch.arange(len(windows.starts))]
@@ -159,7 +159,7 @@ def test_favoured_trips_get_their_share_in_proportion_to_their_length():
     )
 
 
-def test_drawn_windows_show_the_favour():
+def test_draws_have_the_favoured_share():
     uniform = Windows.from_episodes([trip()], 14)
     shares = []
     for windows in (uniform, uniform.favour_trips(0.9, [0], [1])):
@@ -177,27 +177,27 @@ def test_without_a_share_or_without_trips_draws_stay_uniform(episode, share):
     assert torch.equal(windows.favour_trips(share, [0], [1]).cumulative, windows.cumulative)
 
 
-# demonstrations -------------------------------------------------------------------------------------------------------
+# demonstrations -----------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def own_minari(tmp_path, monkeypatch) -> Path:
-    """The user's datasets stay untouched."""
+    """A Minari folder for this test, so that the user's datasets do not change."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return tmp_path / "minari"
 
 
 class Counting:
-    """UMAZE that counts how often it is asked for demonstrations."""
+    """UMAZE that counts how often it generates demonstrations."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.generated = 0
 
     def __getattr__(self, name):
         return getattr(UMAZE, name)
 
     def demonstrate(self, n_steps, seed):
-        self.asked += 1
+        self.generated += 1
         return UMAZE.demonstrate(n_steps, seed)
 
 
@@ -211,34 +211,34 @@ def test_demonstrations_are_generated_once_then_reused_until_steps_or_seed_chang
     assert told == [(2000, 3000), (3000, 3000)]
     assert "cdiff/maze2d-umaze-v0" in minari.list_local_datasets()
     again = demonstrations(task, 3000, 0)
-    assert task.asked == 1
+    assert task.generated == 1
     assert digest(again) == digest(first)
     fewer = demonstrations(task, 2500, 0)
-    assert task.asked == 2
+    assert task.generated == 2
     assert [len(episode) for episode in fewer] == [2001, 501]
     other = demonstrations(task, 2500, 1)
-    assert task.asked == 3
+    assert task.generated == 3
     assert digest(other) != digest(fewer)
     assert digest(load_dataset(UMAZE, "cdiff/maze2d-umaze-v0")) == digest(other)
 
 
 @pytest.mark.usefixtures("own_minari")
-def test_two_that_ask_for_demonstrations_at_once_share_one_generation():
+def test_concurrent_requests_share_one_generation_of_demonstrations():
     task = Counting()
     with ThreadPoolExecutor(2) as pool:
         first, second = pool.map(lambda _: demonstrations(task, 200, 7), range(2))
-    assert task.asked == 1
+    assert task.generated == 1
     assert digest(first) == digest(second)
 
 
-def test_altered_demonstrations_are_generated_anew(own_minari):
+def test_altered_demonstrations_are_generated_again(own_minari):
     task = Counting()
     first = demonstrations(task, 100, 0)
     (file,) = own_minari.rglob("*.hdf5")
     with h5py.File(file, "r+") as dataset:
         dataset["episode_0/observations/observation"][3, 0] += 1.0
     again = demonstrations(task, 100, 0)
-    assert task.asked == 2
+    assert task.generated == 2
     assert digest(again) == digest(first)
 
 
@@ -255,7 +255,7 @@ def test_demonstrations_depend_on_the_modules_of_their_task_and_its_expert(task,
     assert [file.name for file in generating_files(task)] == expected
 
 
-def test_the_digest_sees_lengths_and_values():
+def test_digest_depends_on_lengths_and_values():
     a = np.arange(8.0).reshape(4, 2)
     assert digest([a]) == digest([a.copy()])
     assert (
@@ -263,7 +263,7 @@ def test_the_digest_sees_lengths_and_values():
     )
 
 
-# datasets of others ---------------------------------------------------------------------------------------------------
+# datasets of others -------------------------------------------------------------------------------
 
 
 def write(path: Path, **columns) -> Path:
@@ -273,7 +273,7 @@ def write(path: Path, **columns) -> Path:
     return path
 
 
-def test_d4rl_file_is_cut_at_its_ends_and_turned_into_this_frame(tmp_path):
+def test_d4rl_file_is_cut_into_episodes_and_converted(tmp_path):
     rows = np.zeros((6, 4))
     rows[0] = [0.949, 2.936, 0.5, -1.5]
     path = write(
@@ -287,7 +287,7 @@ def test_d4rl_file_is_cut_at_its_ends_and_turned_into_this_frame(tmp_path):
     assert episodes[0][0] == pytest.approx([-2.364, 2.851, -1.5, -0.5])
 
 
-def test_inputs_of_a_control_tasks_file_are_cut_like_its_states(tmp_path):
+def test_inputs_of_a_control_task_are_cut_like_its_states(tmp_path):
     inputs = np.arange(18.0).reshape(6, 3)
     path = write(
         tmp_path / "hopper.hdf5",
@@ -299,12 +299,12 @@ def test_inputs_of_a_control_tasks_file_are_cut_like_its_states(tmp_path):
     np.testing.assert_array_equal(load_inputs(HOPPER, str(path)), inputs.reshape(2, 3, 3))
 
 
-def test_inputs_of_a_mazes_file_stay_in_its_own_frame_and_are_not_read(tmp_path):
+def test_inputs_of_a_maze_file_are_not_read(tmp_path):
     path = write(tmp_path / "maze.hdf5", observations=np.zeros((6, 4)), actions=np.zeros((6, 2)))
     assert load_inputs(UMAZE, str(path)) == []
 
 
-def test_a_file_without_ends_is_one_episode(tmp_path):
+def test_file_without_ends_is_one_episode(tmp_path):
     path = write(tmp_path / "one.h5", observations=np.zeros((5, 4), dtype=np.float32))
     (episode,) = load_dataset(UMAZE, str(path))
     assert episode.shape == (5, 4)
@@ -336,7 +336,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("case", BAD_FILES)
-def test_a_bad_file_is_refused_for(case, tmp_path):
+def test_bad_file_is_refused_for(case, tmp_path):
     columns, said = BAD_FILES[case]
     path = write(tmp_path / "bad.hdf5", **columns)
     with pytest.raises(CdiffError, match=said) as caught:
@@ -344,14 +344,14 @@ def test_a_bad_file_is_refused_for(case, tmp_path):
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_file_that_is_no_hdf5_is_refused(tmp_path):
+def test_file_that_is_no_hdf5_is_refused(tmp_path):
     path = tmp_path / "text.hdf5"
     path.write_text("hello")
     with pytest.raises(CdiffError, match="not a D4RL-style HDF5 dataset"):
         load_dataset(UMAZE, str(path))
 
 
-def test_a_missing_file_is_called_missing(tmp_path):
+def test_missing_file_error_says_so(tmp_path):
     with pytest.raises(
         CdiffError, match=r"none\.hdf5: no such file; expected a D4RL-style HDF5 dataset"
     ):
@@ -359,7 +359,7 @@ def test_a_missing_file_is_called_missing(tmp_path):
 
 
 @pytest.mark.usefixtures("own_minari")
-def test_a_missing_minari_dataset_is_answered_with_those_that_are_here():
+def test_missing_minari_dataset_error_lists_the_local_ones():
     with pytest.raises(
         CdiffError, match=r'no local Minari dataset "D4RL/x-v1".*local datasets: none'
     ):
@@ -370,7 +370,7 @@ def test_a_missing_minari_dataset_is_answered_with_those_that_are_here():
 
 
 @pytest.mark.usefixtures("own_minari")
-def test_a_minari_dataset_of_another_environment_is_refused():
+def test_minari_dataset_of_another_environment_is_refused():
     demonstrations(UMAZE, 20, 0)
 
     class Arm:

@@ -1,4 +1,4 @@
-"""Training that resumes to the same bits, and checkpoints that vouch for themselves."""
+"""Training that resumes to the same bits, and checkpoints whose cards are checked."""
 
 import hashlib
 from pathlib import Path
@@ -50,7 +50,7 @@ TINY = TrainSpec(
 
 @pytest.fixture(scope="module", autouse=True)
 def own_minari(tmp_path_factory):
-    """The user's datasets stay untouched; all tests here share one small set of demonstrations."""
+    """A Minari folder for this file, with one small set of demonstrations for all its tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         yield
@@ -95,7 +95,7 @@ def stop_at(step: int, error: type[BaseException] = KeyboardInterrupt):
     return on_step
 
 
-# resuming -------------------------------------------------------------------------------------------------------------
+# resuming -----------------------------------------------------------------------------------------
 
 
 def test_training_repeats_with_its_seed_and_differs_with_another(whole, tmp_path):
@@ -129,7 +129,7 @@ def test_interrupted_training_resumes_to_the_same_bits(whole, step, error, tmp_p
     ],
 )
 def test_interruption_within_a_step_resumes_to_the_same_bits(whole, place, save_every, tmp_path):
-    """Ctrl-C nearly always falls here: after the random numbers of a step are drawn, before its update is whole."""
+    """Ctrl-C nearly always comes after the random draws of a step and before its update is done."""
     module, _, name = place.rpartition(".")
     owner = {
         "cdiff_cli.training.state": cdiff_cli.training.state,
@@ -188,7 +188,7 @@ def test_resuming_without_or_with_a_damaged_state_is_refused(tmp_path):
         fit(tmp_path, resume=True)
 
 
-# fitting --------------------------------------------------------------------------------------------------------------
+# fitting ------------------------------------------------------------------------------------------
 
 
 def test_loss_decreases(tmp_path):
@@ -206,7 +206,7 @@ def test_loss_decreases(tmp_path):
     assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
 
 
-def test_a_loss_that_is_no_number_is_an_error(tmp_path, monkeypatch):
+def test_nan_loss_is_an_error(tmp_path, monkeypatch):
     nan = torch.tensor(float("nan"), requires_grad=True)
     monkeypatch.setattr(cdiff_cli.training.state, "training_loss", lambda *_: (nan, nan.detach()))
     with pytest.raises(
@@ -215,7 +215,7 @@ def test_a_loss_that_is_no_number_is_an_error(tmp_path, monkeypatch):
         fit(tmp_path)
 
 
-def test_an_unknown_size_is_answered_with_the_closest(tmp_path):
+def test_unknown_size_error_names_the_closest(tmp_path):
     with pytest.raises(
         CdiffError, match=r'no recipe "tinny" \(did you mean "tiny"\?\); maze2d-umaze has tiny'
     ):
@@ -227,14 +227,14 @@ def test_only_the_whole_first_and_last_state_are_pinned():
 
 
 @pytest.mark.parametrize("name", ["cuda:99", "toaster"])
-def test_a_device_that_cannot_be_used_is_an_error_with_advice(name):
+def test_unusable_device_is_an_error_with_advice(name):
     with pytest.raises(
         CdiffError, match=f'device "{name}" cannot be used here: .*; try --device cpu'
     ):
         choose_device(name)
 
 
-def test_devices_that_can_be_used():
+def test_usable_devices_are_chosen():
     assert choose_device("cpu") == CPU
     assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -248,14 +248,14 @@ def test_data_statistics_by_hand():
     assert facts["speed_q50"] == facts["speed_q95"] == facts["speed_max"] == 2.0
 
 
-def test_episodes_shorter_than_a_window_have_no_say_in_the_speeds():
+def test_episodes_shorter_than_a_window_do_not_count_for_the_speeds():
     n = np.arange(6.0)[:, None]
     steady = np.hstack((0.02 * n, 0 * n, 0 * n + 2.0, 0 * n))
     facts = data_statistics(UMAZE, [steady, *[steady[:2]] * 20], horizon=4)
     assert facts["speed_q50"] == 2.0
 
 
-# checkpoints ----------------------------------------------------------------------------------------------------------
+# checkpoints --------------------------------------------------------------------------------------
 
 
 def copy(checkpoint: Checkpoint, folder: Path) -> Path:
@@ -266,7 +266,7 @@ def copy(checkpoint: Checkpoint, folder: Path) -> Path:
     return path
 
 
-def test_the_card_says_what_the_checkpoint_is(whole):
+def test_card_describes_the_checkpoint(whole):
     card = whole.card
     assert (card.task, card.recipe, card.horizon, card.n_steps, card.seed, card.steps) == (
         "maze2d-umaze",
@@ -283,7 +283,7 @@ def test_the_card_says_what_the_checkpoint_is(whole):
     assert load(card_path(whole.path), Card) == card
 
 
-def test_a_checkpoint_round_trips(whole, tmp_path):
+def test_checkpoint_round_trips(whole, tmp_path):
     path = copy(whole, tmp_path)
     again = load_checkpoint(path, "maze2d-umaze")
     x = torch.linspace(-1, 1, 2 * 32 * 4).reshape(2, 32, 4)
@@ -301,12 +301,12 @@ def test_a_checkpoint_round_trips(whole, tmp_path):
     assert saved.card == again.card
 
 
-def test_kept_demonstrations_lie_in_the_maze(whole):
+def test_demonstrations_in_the_checkpoint_are_in_the_maze(whole):
     points = whole.demonstrations[..., :2].double().reshape(-1, 2).numpy()
     assert np.abs(points).max() < 1.5  # the umaze's free cells
 
 
-def test_no_unfinished_file_stays_beside_a_checkpoint(whole):
+def test_no_partial_file_stays_beside_a_checkpoint(whole):
     names = {path.name for path in whole.path.parent.iterdir()}
     assert names == {"model.safetensors", "model.card.yaml", "state.safetensors"}
 
@@ -330,7 +330,7 @@ def lose(path: Path) -> None:
 
 
 def damage_honestly(path: Path) -> None:
-    """Not safetensors, though the card's hash holds."""
+    """A file that is no safetensors, with a card of the right hash."""
     path.write_bytes(b"not safetensors")
     card = yaml.safe_load(card_path(path).read_text())
     card["weights_sha256"] = hashlib.sha256(b"not safetensors").hexdigest()
@@ -347,7 +347,7 @@ HARM = {
 
 
 @pytest.mark.parametrize("harm", HARM, ids=lambda harm: harm.__name__)
-def test_a_harmed_checkpoint_is_refused_with_advice(harm, whole, tmp_path):
+def test_damaged_checkpoint_is_refused_with_advice(harm, whole, tmp_path):
     path = copy(whole, tmp_path)
     harm(path)
     with pytest.raises(CheckpointError, match=HARM[harm]) as caught:
@@ -357,9 +357,12 @@ def test_a_harmed_checkpoint_is_refused_with_advice(harm, whole, tmp_path):
     )
 
 
-def test_a_checkpoint_of_another_task_is_refused_with_advice(whole):
-    said = "a checkpoint of maze2d-umaze, asked for was maze2d-large; train one with `cdiff train --task maze2d-large`"
-    with pytest.raises(CheckpointError, match=said):
+def test_checkpoint_of_another_task_is_refused_with_advice(whole):
+    message = (
+        "a checkpoint of maze2d-umaze, asked for was maze2d-large; "
+        "train one with `cdiff train --task maze2d-large`"
+    )
+    with pytest.raises(CheckpointError, match=message):
         load_checkpoint(whole.path, "maze2d-large")
 
 
@@ -381,7 +384,7 @@ def test_install_keeps_the_previous_checkpoint(whole, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "path", [*SHIPPED, *BASES], ids=lambda path: f"{path.parent.name}-{path.stem}"
 )
-def test_shipped_checkpoint_loads_is_small_and_its_card_holds(path):
+def test_shipped_checkpoint_loads_is_small_and_matches_its_card(path):
     checkpoint = load_checkpoint(path, path.parent.name)
     own = load(path.parent / "recipe.yaml", Recipe)
     assert path.stat().st_size <= 10 * 2**20
@@ -409,7 +412,7 @@ def test_checkpoints_are_shipped_for_every_task_that_is_trained():
     assert [path.parent.name for path in SHIPPED] == trained
 
 
-def test_the_commit_is_none_without_git(monkeypatch):
+def test_commit_is_none_without_git(monkeypatch):
     def missing(*_, **__):
         raise FileNotFoundError("git")
 
@@ -419,7 +422,7 @@ def test_the_commit_is_none_without_git(monkeypatch):
     assert cdiff_cli.machine.git_commit() == "none"
 
 
-def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
+def test_loading_a_checkpoint_does_not_change_the_global_generator(whole):
     torch.manual_seed(3)
     expected = torch.rand(2)
     torch.manual_seed(3)
@@ -427,8 +430,8 @@ def test_loading_a_checkpoint_leaves_the_global_generator_alone(whole):
     assert torch.equal(torch.rand(2), expected)
 
 
-def test_dynamics_that_explain_too_little_are_not_kept(monkeypatch, tmp_path):
-    """Plans would be held to them; the card still says how much they explain."""
+def test_dynamics_that_explain_too_little_are_not_saved(monkeypatch, tmp_path):
+    """The card still says how much they explain."""
     module = cdiff_cli.training.system_identification
     fitted = module.fit
     monkeypatch.setattr(module, "fit", lambda *data: (fitted(*data)[0], 0.98))
@@ -437,12 +440,12 @@ def test_dynamics_that_explain_too_little_are_not_kept(monkeypatch, tmp_path):
     assert checkpoint.card.linear == 0.98
 
 
-def test_the_maze_keeps_its_dynamics(whole):
+def test_maze_checkpoint_has_dynamics(whole):
     assert whole.dynamics is not None
     assert whole.card.linear > 0.99
 
 
-# recipes --------------------------------------------------------------------------------------------------------------
+# recipes ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -453,7 +456,7 @@ def test_the_maze_keeps_its_dynamics(whole):
         ("{multipliers: [1, 2, 2, 2, 2, 2, 2, 2, 2]}", "the horizon 128 does not divide by 256"),
     ],
 )
-def test_a_network_that_cannot_be_built_is_refused_by_its_recipe(network, complaint, tmp_path):
+def test_recipe_refuses_a_network_that_cannot_be_built(network, complaint, tmp_path):
     text = (MODELS / "maze2d-umaze" / "recipe.yaml").read_text()
     path = tmp_path / "recipe.yaml"
     path.write_text(

@@ -1,4 +1,4 @@
-"""Training a control task from its demonstrations to a checkpoint that acts."""
+"""Training for receding-horizon control, from demonstrations to a checkpoint."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ TINY = TrainSpec(
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """(checkpoint as loaded again, what was told along the way)."""
+    """(checkpoint as loaded again, reported steps)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         changes = {"demonstrations": DemonstrationSpec(steps=1000), "train": {"tiny": TINY}}
@@ -41,13 +41,13 @@ def trained(tmp_path_factory):
         return load_checkpoint(made.path, "ball-run"), told
 
 
-def test_the_planner_is_trained_and_then_the_inverse_dynamics(trained):
+def test_planner_is_trained_before_the_inverse_dynamics(trained):
     assert trained[1] == [("training", k) for k in range(1, 7)] + [
         ("inverse dynamics", k) for k in range(1, 5)
     ]
 
 
-def test_a_checkpoint_of_a_control_task_holds_frame_and_inverse_dynamics(trained):
+def test_checkpoint_of_a_control_task_has_frame_and_inverse_dynamics(trained):
     checkpoint = trained[0]
     assert checkpoint.frame is not None
     assert checkpoint.frame.mean.shape == (16, 4)

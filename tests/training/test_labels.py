@@ -1,12 +1,13 @@
-"""Labels of windows, classifier-free guidance, and training that begins from an unconditional planner."""
+"""Labels of windows, classifier-free guidance, training from an unconditional planner."""
 
 import shutil
 
 import pytest
 import torch
 
-from cdiff_cli.commands.plan import _plan_both
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.plan import plan_both
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.constraints.spec.load import kinds_sha256, load_constraints
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
@@ -33,7 +34,7 @@ def condition(b=0.5):
     )
 
 
-def test_a_window_is_labelled_by_its_worst_g_clipped():
+def test_label_of_a_window_is_its_largest_g_clipped():
     x = torch.zeros(4, 3, 4)
     x[:, 1, 0] = torch.tensor([0.4, 0.5, 0.75, 9.0])
     assert condition().label(x).tolist() == [[1.0, 0.0], [1.0, 0.0], [-1.0, 0.25], [-1.0, 1.0]]
@@ -49,7 +50,7 @@ def test_a_quarter_of_the_labels_are_dropped_whole():
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_an_untrained_condition_changes_nothing_and_a_label_of_zeros_never_does(size):
+def test_untrained_condition_and_zero_label_change_nothing(size):
     net, x, t = SIZES[size](2), normal(0, 3, 8, 4).float(), torch.tensor([1.0, 2.0, 3.0])
     free = net(x, t)
     assert torch.equal(net(x, t, torch.tensor([[1.0, 0.5]]).expand(3, -1)), free)
@@ -59,7 +60,7 @@ def test_an_untrained_condition_changes_nothing_and_a_label_of_zeros_never_does(
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_room_for_a_condition_leaves_the_other_weights_as_they_are_drawn(size):
+def test_condition_layer_does_not_change_the_initial_weights_of_the_others(size):
     made = []
     for conditions in (0, 2):
         with torch.random.fork_rng(devices=[]):
@@ -70,19 +71,19 @@ def test_room_for_a_condition_leaves_the_other_weights_as_they_are_drawn(size):
 
 
 class _Means(torch.nn.Module):
-    """0.1 where unconditioned, 0.3 where asked to obey."""
+    """Estimates of 0.1 without a label and 0.3 with one."""
 
     def forward(self, x, t, label):
         return torch.zeros_like(x) + 0.1 + 0.2 * label[:, :1, None]
 
 
 @pytest.mark.parametrize(("weight", "answer"), [(1.0, 0.3), (2.0, 0.5), (0.5, 0.2), (9.0, 1.0)])
-def test_guidance_extrapolates_from_the_free_to_the_asked_estimate_and_clips(weight, answer):
+def test_guidance_extrapolates_from_the_free_to_the_conditional_estimate_and_clips(weight, answer):
     out = guided(_Means(), weight)(torch.zeros(2, 3, 4), 5)
     torch.testing.assert_close(out, torch.full((2, 3, 4), answer))  # one clip: 0.1 + 9 * 0.2 = 1.9
 
 
-def test_the_hash_of_constraints_ignores_comments_and_sees_numbers(tmp_path):
+def test_hash_of_constraints_depends_on_numbers_not_comments(tmp_path):
     text = "task: maze2d-umaze\nconstraints:\n  - {name: cut, kind: linear, a: {x: 1.0}, b: 1.0}\n"
     hashes = []
     for i, variant in enumerate((text, "# a comment\n" + text, text.replace("b: 1.0", "b: 1.1"))):
@@ -95,7 +96,7 @@ def test_the_hash_of_constraints_ignores_comments_and_sees_numbers(tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ LABELLED = TINY.model_copy(
 )
 
 
-def test_a_conditional_planner_begins_from_the_unconditional_one(place, tmp_path):
+def test_conditional_planner_starts_from_the_unconditional_one(place, tmp_path):
     made = fit(
         tmp_path, LABELLED.model_copy(update={"learning_rate": 1e-12}), condition=condition()
     )
@@ -132,7 +133,7 @@ def test_a_conditional_planner_begins_from_the_unconditional_one(place, tmp_path
 
 
 @pytest.mark.usefixtures("place")
-def test_training_with_labels_moves_the_condition_and_resumes_to_the_same_bits(tmp_path):
+def test_training_with_labels_changes_the_condition_and_resumes_to_the_same_bits(tmp_path):
     whole = fit(tmp_path / "whole", LABELLED, condition=condition())
     assert float(whole.net.condition.weight.abs().max()) > 0
 
@@ -160,26 +161,28 @@ def test_training_with_labels_moves_the_condition_and_resumes_to_the_same_bits(t
         ),
     ],
 )
-def test_a_recipe_that_does_not_fit_the_condition_is_one_clear_line(spec, asked, message, tmp_path):
+def test_recipe_that_does_not_fit_the_condition_is_refused_in_one_line(
+    spec, asked, message, tmp_path
+):
     with pytest.raises((CdiffError, CheckpointError), match=message):
         fit(tmp_path, spec, condition=asked)
 
 
 @pytest.mark.usefixtures("place")
-def test_a_base_of_another_network_or_other_data_is_refused(tmp_path):
+def test_base_of_another_network_is_refused(tmp_path):
     wider = LABELLED.network.model_copy(update={"width": 16})
     with pytest.raises(CheckpointError, match="its network differs from the one of this recipe"):
         fit(tmp_path / "a", LABELLED.model_copy(update={"network": wider}), condition=condition())
 
 
-# planning -------------------------------------------------------------------------------------------------------------
+# planning -----------------------------------------------------------------------------------------
 
 
-def test_the_shipped_planner_violates_less_than_the_unconditional_one_and_counts_both_calls():
-    """Seeds 0-9, 64 steps: 0.004 of the violation was left; here four plans of 16 steps each."""
+def test_shipped_conditional_planner_violates_less_and_counts_both_calls():
+    """With 64 steps and seeds 0-9, 0.004 of the violation is left; this test plans 16 steps."""
     resolved = resolve(Request(method="conditional", preset="paper", n=4, steps=16))
-    plans, free = _plan_both(resolved, lambda *_: None)
-    left, before = (violation(resolved.problem.g, each.x).sum() for each in (plans, free))
+    plans, free = plan_both(resolved, lambda *_: None)
+    left, before = (violation(resolved.declared, each.x).sum() for each in (plans, free))
     assert left < 0.6 * before
     assert plans.calls == 2 * free.calls
 
@@ -191,4 +194,4 @@ def test_constraints_edited_since_training_are_refused(tmp_path):
     with pytest.raises(CheckpointError, match="trained for other constraints than"):
         resolve(Request(method="conditional", constraints=file))
     file.write_text("# a comment\n" + text)
-    assert resolve(Request(method="conditional", constraints=file)).guided is not None
+    assert resolve(Request(method="conditional", constraints=file)).conditional is not None

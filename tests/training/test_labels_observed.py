@@ -1,4 +1,4 @@
-"""Planners conditioned on constraints that wait for what is observed: what a run would have seen, labels, training, acting."""
+"""Planners conditioned on constraints with observed quantities: simulation, labels, training."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +12,15 @@ from gymnasium.utils import seeding
 from typer.testing import CliRunner
 
 from cdiff_cli.cli import app
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.commands.run_directory import read_rows
 from cdiff_cli.errors import CdiffError
 from cdiff_cli.models.checkpoint import load_checkpoint
 from cdiff_cli.models.denoiser import ObservationEncoder, guided
 from cdiff_cli.models.recipe import load_recipe
-from cdiff_cli.planning.receding_horizon import control
+from cdiff_cli.planning.receding_horizon import rollout
 from cdiff_cli.tasks.ball_run.env import DT, BallRunEnv
 from cdiff_cli.tasks.ball_run.obstacles import PATTERNS, beside
 from cdiff_cli.tasks.ball_run.task import BALL_RUN
@@ -39,7 +40,7 @@ def condition():
 
 @pytest.fixture(scope="module", autouse=True)
 def own_minari(tmp_path_factory):
-    """The user's datasets stay untouched."""
+    """A Minari folder for this file, so that the user's datasets do not change."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         yield
@@ -59,11 +60,11 @@ def seen(*values):
     }
 
 
-# what would have been seen --------------------------------------------------------------------------------------------
+# simulated observations ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_a_run_is_shown_what_the_environment_shows_beside_a_ghost(pattern):
+def test_simulated_observations_equal_those_of_the_environment_with_a_ghost(pattern):
     env = BallRunEnv(pattern, collide=False)
     obs, _ = env.reset(seed=5)
     run, there, rng = (
@@ -79,13 +80,13 @@ def test_a_run_is_shown_what_the_environment_shows_beside_a_ghost(pattern):
     (
         drawn.integers(len(PATTERNS)),
         drawn.uniform(-0.01, 0.01, 2),
-    )  # what a reset draws before the pattern
+    )  # draws of a reset before the pattern
     np.testing.assert_allclose(
         beside(PATTERNS[pattern](drawn), np.array(run)[:, :2], DT), there, atol=1e-9
     )  # rounding, summed
 
 
-def test_every_pattern_is_met_along_a_run():
+def test_simulated_observations_include_patterns_from_behind_and_ahead():
     run, rng = np.zeros((3, 4)), np.random.default_rng(0)
     begun = {
         tuple(np.sign(values[0]) for values in BALL_RUN.observed_along(run, rng).values())
@@ -95,17 +96,20 @@ def test_every_pattern_is_met_along_a_run():
     assert any(signs[2] < 0 < signs[0] for signs in begun)  # from ahead towards the ball
 
 
-# labels ---------------------------------------------------------------------------------------------------------------
+# labels -------------------------------------------------------------------------------------------
 
 
-def test_the_condition_says_which_quantities_its_constraints_observe(condition):
+def test_condition_lists_the_observed_quantities_of_its_constraints(condition):
     assert condition.observed == BALL_RUN.observable
     assert condition.entries == 6
 
 
-def test_a_window_is_labelled_by_the_constraint_bound_to_the_obstacle_it_met(condition):
-    """Straight at 3 m/s: psi_k = D - 0.1 k - 1.2 - 0.2 * 3 against a ball at rest D ahead, g_k = psi_k / 2 - psi_{k+1}: the worst,
-    the last, is 0.1 - psi_14 / 2."""
+def test_window_is_labelled_by_the_constraint_bound_to_its_obstacle(condition):
+    """The window runs straight at 3 m/s towards a ball at rest at distance D.
+
+    psi_k = D - 0.1 k - 1.2 - 0.2 * 3 and g_k = psi_k / 2 - psi_{k+1}. The largest g is the last
+    one, 0.1 - psi_14 / 2.
+    """
     for distance, label in (
         (3.0, (-1.0, 0.2)),
         (3.3, (-1.0, 0.05)),
@@ -116,10 +120,10 @@ def test_a_window_is_labelled_by_the_constraint_bound_to_the_obstacle_it_met(con
         torch.testing.assert_close(found, torch.tensor([label]), atol=1e-5, rtol=0)  # float32
 
 
-def test_the_obstacle_of_a_label_goes_on_as_it_is_seen_to(condition):
+def test_label_extrapolates_the_obstacle_at_its_observed_velocity(condition):
     assert condition.label(straight(), seen(3.0, 0.0, 3.0, 0.0), DT).tolist() == [
         [1.0, 0.0]
-    ]  # as fast: never nearer
+    ]  # at equal speed the distance stays
     assert condition.label(straight(), seen(5.0, 0.0, -3.0, 0.0), DT)[0, 0] == -1.0
 
 
@@ -148,7 +152,7 @@ def test_network_gets_quantities_relative_to_the_coordinate_they_are_mapped_to()
 
 @pytest.fixture(scope="module")
 def drawn(condition):
-    """4000 windows of a few demonstrations, and what a network is told of them."""
+    """Labels and observations of 4000 windows of a few demonstrations."""
     episodes, recipe = demonstrations(BALL_RUN, 2000, 0), load_recipe("ball-run")
     data = TrainingSet.from_episodes(
         BALL_RUN, recipe, recipe.train["conditional"], episodes, condition, 0
@@ -163,36 +167,36 @@ def test_label_and_observation_are_dropped_together(drawn):
     assert drawn[told][:, 2:].any(1).all()
 
 
-def test_both_labels_are_met_often(drawn):
-    """31.7 % of the windows of all demonstrations violate; here of 19 runs, each beside eight obstacles."""
+def test_both_labels_are_frequent(drawn):
+    """31.7 % of the windows of all demonstrations violate; these are 19 runs with 8 obstacles."""
     told = drawn[drawn[:, 0] != 0]
     assert 0.15 < float((told[:, 0] < 0).float().mean()) < 0.5
 
 
-def test_a_task_that_cannot_draw_what_is_observed_is_refused_in_one_line(condition):
+def test_task_without_simulated_observations_is_refused_in_one_line(condition):
     task = SimpleNamespace(name="drone", layout=BALL_RUN.layout)
     with pytest.raises(
         CdiffError,
-        match=r"^drone: the constraints observe obstacle\.x, .*, which demonstrations do not hold.*$",
+        match=r"^drone: the constraints observe obstacle\.x, .* demonstrations do not hold.*$",
     ):
         SampledObservations.from_task(task, [np.zeros((20, 4))], condition.observed, 0)
 
 
 class _Told(torch.nn.Module):
-    """The third entry of what it is told."""
+    """An estimate equal to the third entry of the label."""
 
     def forward(self, x, t, condition):
         return torch.zeros_like(x) + condition[:, 2, None, None]
 
 
-def test_what_is_observed_is_told_with_the_condition_and_not_without():
+def test_observation_is_an_input_of_the_conditional_estimate_alone():
     told = torch.tensor([[0.25], [0.5]])
     for weight in (1.0, 2.0):
         out = guided(_Told(), weight, 1.0, told)(torch.zeros(2, 3, 4), 5)
         torch.testing.assert_close(out[:, 0, 0], weight * told[:, 0])
 
 
-# training and acting --------------------------------------------------------------------------------------------------
+# training and acting ------------------------------------------------------------------------------
 
 TINY = {
     "network": {"kind": "mlp", "width": 16, "depth": 1},
@@ -210,7 +214,7 @@ def cdiff(*words):
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A home with a planner of the ball run and one conditioned on its constraints, both trained as typed."""
+    """A home with a plain and a conditional planner of the ball run, trained by commands."""
     root = tmp_path_factory.mktemp("home")
     (root / "models" / "ball-run").mkdir(parents=True)
     (root / "constraints").mkdir()
@@ -230,7 +234,7 @@ def place(tmp_path_factory):
         yield root
 
 
-def test_a_planner_is_trained_and_acts_as_typed(place, tmp_path):
+def test_conditional_planner_is_trained_and_acts_from_the_command_line(place, tmp_path):
     made = load_checkpoint(
         place / "models" / "ball-run" / "conditional-ball-run.safetensors", "ball-run"
     )
@@ -256,7 +260,7 @@ def test_a_planner_is_trained_and_acts_as_typed(place, tmp_path):
 
 
 @pytest.mark.usefixtures("place")
-def test_each_plan_is_told_what_is_observed_when_it_is_made():
+def test_every_plan_gets_the_observation_of_its_own_step():
     acting, told = (
         controller(resolve(Request(task="ball-run", method="conditional", preset="paper", n=2))),
         [],
@@ -264,9 +268,10 @@ def test_each_plan_is_told_what_is_observed_when_it_is_made():
 
     def spy(observed, present):
         told.append((present.clone(), torch.stack(tuple(observed.values()), 1)))
-        return acting.seeing(observed, present)
+        return acting.planner.conditioned_denoiser(observed, present)
 
-    done = control(replace(acting, seeing=spy), [0, 1], steps=3)
+    spied = replace(acting, planner=replace(acting.planner, conditioned_denoiser=spy))
+    done = rollout(spied, BALL_RUN, [0, 1], steps=3)
     assert len(told) == 3
     for step, (present, observed) in enumerate(told):
         np.testing.assert_array_equal(present.numpy(), done.x[:, step])

@@ -1,4 +1,4 @@
-"""Labels of the return, training with them, and planners that are asked for the most."""
+"""Labels of the return, training with them, and plans for the highest return."""
 
 import h5py
 import numpy as np
@@ -6,7 +6,8 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from cdiff_cli.commands.resolve import Request, resolve
+from cdiff_cli.commands.experiment import Request
+from cdiff_cli.commands.resolve import resolve
 from cdiff_cli.commands.rollout import controller
 from cdiff_cli.constraints.state_sets import HalfSpace
 from cdiff_cli.constraints.trajectory import Constraint
@@ -25,29 +26,29 @@ from tests.problems import generator, num, vec
 from tests.training.test_fit import same
 from tests.training.test_fit_control import TINY
 
-DISCOUNT = 0.75  # four steps must be left
+DISCOUNT = 0.75  # four steps must remain for a label
 
 
 def walk(steps, rate=1.0):
-    """States of one walk, each of them new."""
+    """States of one walk, all different."""
     return np.arange(steps + 1.0)[:, None] + rate
 
 
-# labels ---------------------------------------------------------------------------------------------------------------
+# labels -------------------------------------------------------------------------------------------
 
 
-def test_a_constant_reward_is_its_own_mean_and_the_last_steps_of_a_walk_have_none():
+def test_constant_reward_is_its_mean_and_the_last_steps_of_a_walk_have_none():
     (found,) = mean_rewards([walk(10)], [np.full(10, 0.3)], DISCOUNT)
     np.testing.assert_allclose(found[:7], 0.3, rtol=1e-12)  # rounding of sums and their quotient
     assert np.isnan(found[7:]).all()
 
 
-def test_the_mean_by_hand():
+def test_mean_reward_by_hand():
     (found,) = mean_rewards([walk(4)], [np.array([1.0, 0.0, 4.0, 0.0])], DISCOUNT)
     assert found[0] == pytest.approx((1 + 4 * 0.75**2) / (1 + 0.75 + 0.75**2 + 0.75**3))
 
 
-def test_a_walk_cut_in_pieces_is_one_walk_again():
+def test_walk_cut_into_episodes_counts_as_one_walk():
     rng = np.random.default_rng(0)
     x, r = walk(30), rng.normal(size=30)
     (whole,) = mean_rewards([x], [r], DISCOUNT)
@@ -57,7 +58,7 @@ def test_a_walk_cut_in_pieces_is_one_walk_again():
     )
 
 
-def test_another_walk_has_no_say():
+def test_walks_do_not_affect_each_other():
     rng = np.random.default_rng(0)
     x, y, r, s = walk(20), walk(20, 0.5), rng.normal(size=20), rng.normal(size=20)
     alone = [*mean_rewards([x], [r], DISCOUNT), *mean_rewards([y], [s], DISCOUNT)]
@@ -65,12 +66,12 @@ def test_another_walk_has_no_say():
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_file_with_a_reward_for_its_last_state_too_counts_it():
+def test_reward_of_the_last_state_counts():
     (found,) = mean_rewards([walk(4)], [np.array([0.0, 0.0, 0.0, 0.0, 1.0])], DISCOUNT)
     assert found[0] > 0
 
 
-def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknown():
+def test_labels_run_from_low_to_high_quantile_and_are_zero_if_unknown():
     episodes = [walk(5, 10.0 * k) for k in range(101)]
     returns = ReturnLabel.from_episodes(
         episodes, [np.full(5, k / 100) for k in range(101)], DISCOUNT
@@ -81,7 +82,7 @@ def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknow
     assert label[100, 0].tolist() == [1.0, 0.0]
     torch.testing.assert_close(
         label[50, 1], torch.tensor([0.0, 1.0]), atol=1e-6, rtol=0
-    )  # float32; a middling return is told too
+    )  # float32; a middle return has a label too
     assert label[:, 2:].abs().max() == 0
     assert returns.record(DISCOUNT) == {
         "discount": 0.75,
@@ -101,16 +102,17 @@ def test_labels_run_from_the_low_to_the_high_quantile_and_are_zeros_where_unknow
         (np.zeros(10), "all demonstrations return the same, 0 per step"),
         (
             np.arange(3.0),
-            r"no demonstration is 4 steps long, as a return at discount 0\.75 needs; lower the discount",
+            r"no demonstration is 4 steps long, as a return at discount 0\.75 needs; "
+            "lower the discount",
         ),
     ],
 )
-def test_rewards_that_tell_nothing_apart_are_refused(rewards, said):
+def test_equal_returns_are_refused(rewards, said):
     with pytest.raises(CdiffError, match=said):
         ReturnLabel.from_episodes([walk(len(rewards))], [rewards], DISCOUNT)
 
 
-# rewards --------------------------------------------------------------------------------------------------------------
+# rewards ------------------------------------------------------------------------------------------
 
 
 def rewards_file(path, **columns):
@@ -133,7 +135,8 @@ def test_rewards_of_a_file_are_cut_like_its_states(tmp_path):
     [
         (
             {"actions": np.zeros(6)},
-            "it needs rewards and timeouts, because its recipe conditions the planner on the return",
+            "it needs rewards and timeouts, "
+            "because its recipe conditions the planner on the return",
         ),
         (
             {"rewards": np.full(6, np.nan)},
@@ -147,7 +150,7 @@ def test_rewards_of_a_file_are_cut_like_its_states(tmp_path):
         ),
     ],
 )
-def test_a_dataset_without_good_rewards_is_refused_in_one_line(columns, said, tmp_path):
+def test_dataset_with_bad_rewards_is_refused_in_one_line(columns, said, tmp_path):
     source = rewards_file(tmp_path, **columns)
     with pytest.raises(CdiffError, match=said) as caught:
         load_rewards(source, [walk(5)])
@@ -155,11 +158,11 @@ def test_a_dataset_without_good_rewards_is_refused_in_one_line(columns, said, tm
     assert "\n" not in str(caught.value)
 
 
-# guidance -------------------------------------------------------------------------------------------------------------
+# guidance -----------------------------------------------------------------------------------------
 
 
 class _Counted(torch.nn.Module):
-    """0.1 where nothing is asked for, 0.3 where the most is; the batches that it was called with."""
+    """Estimates of 0.1 without a label and 0.3 for the highest return; records its batches."""
 
     def __init__(self):
         torch.nn.Module.__init__(self)
@@ -174,7 +177,7 @@ class _Counted(torch.nn.Module):
     ("weight", "answer", "batches"),
     [(0.0, 0.1, [2]), (1.0, 0.3, [2]), (2.0, 0.5, [4]), (0.5, 0.2, [4])],
 )
-def test_weight_0_is_the_plain_estimate_and_only_guidance_beyond_1_asks_twice(
+def test_weight_0_is_the_unconditional_estimate_and_only_weights_beyond_1_take_two_calls(
     weight, answer, batches
 ):
     net = _Counted()
@@ -185,7 +188,7 @@ def test_weight_0_is_the_plain_estimate_and_only_guidance_beyond_1_asks_twice(
     assert calls_a_step(weight) == sum(batches) // 2
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 TOLD = TINY.model_copy(
     update={
@@ -206,7 +209,7 @@ RECIPE = load_recipe("ball-run").model_copy(update=OWN)
 
 @pytest.fixture(scope="module", autouse=True)
 def own_minari(tmp_path_factory):
-    """The user's datasets stay untouched."""
+    """A Minari folder for this file, so that the user's datasets do not change."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         yield
@@ -221,7 +224,7 @@ def whole(tmp_path_factory):
     return fit(tmp_path_factory.mktemp("whole"))
 
 
-def test_the_card_says_what_the_planner_was_told(whole):
+def test_card_records_the_return_labels(whole):
     told = whole.card.returns
     assert told["discount"] == 0.9
     assert told["low"] < told["high"]
@@ -240,7 +243,7 @@ def test_training_with_returns_resumes_to_the_same_bits(whole, tmp_path):
     assert same(fit(tmp_path, resume=True).path, whole.path)
 
 
-def test_windows_are_drawn_with_the_label_of_their_first_state_and_a_share_without():
+def test_windows_have_the_label_of_their_first_state_or_none():
     episodes = demonstrations(BALL_RUN, 1000, 0)
     count = sum(map(len, episodes))
     labels = torch.stack((torch.arange(count) + 1.0, -torch.arange(count) - 1.0), 1)
@@ -256,9 +259,7 @@ def test_windows_are_drawn_with_the_label_of_their_first_state_and_a_share_witho
     )  # four standard errors
 
 
-def test_a_conditional_planner_begins_from_it_without_what_its_labels_mean(
-    whole, tmp_path, monkeypatch
-):
+def test_conditional_planner_starts_from_it_without_its_label_weights(whole, tmp_path, monkeypatch):
     (tmp_path / "models" / "ball-run").mkdir(parents=True)
     monkeypatch.setattr("cdiff_cli.training.fit.home", lambda: tmp_path)
     monkeypatch.setattr("cdiff_cli.models.checkpoint.home", lambda: tmp_path)
@@ -274,7 +275,7 @@ def test_a_conditional_planner_begins_from_it_without_what_its_labels_mean(
     )  # kept in half precision
 
 
-def test_a_base_of_other_demonstrations_is_refused_with_its_recipe(whole, tmp_path, monkeypatch):
+def test_base_of_other_demonstrations_error_names_its_recipe(whole, tmp_path, monkeypatch):
     (tmp_path / "models" / "ball-run").mkdir(parents=True)
     monkeypatch.setattr("cdiff_cli.training.fit.home", lambda: tmp_path)
     monkeypatch.setattr("cdiff_cli.models.checkpoint.home", lambda: tmp_path)
@@ -308,7 +309,7 @@ def test_a_base_of_other_demonstrations_is_refused_with_its_recipe(whole, tmp_pa
         ({}, True, "expected no --conditional FILE beside its returns"),
     ],
 )
-def test_a_recipe_that_does_not_fit_its_returns_is_one_clear_line(change, asked, said, tmp_path):
+def test_recipe_that_does_not_fit_its_returns_is_refused_in_one_line(change, asked, said, tmp_path):
     side = ConstraintLabel(
         "side", Constraint((AtWaypoints("y", HalfSpace(vec(0.0, 1.0, 0.0, 0.0), num(0.5))),)), "abc"
     )
@@ -317,7 +318,7 @@ def test_a_recipe_that_does_not_fit_its_returns_is_one_clear_line(change, asked,
         fit(tmp_path, recipe=recipe, condition=side if asked else None)
 
 
-def test_a_dataset_without_rewards_is_refused_before_anything_is_trained(tmp_path):
+def test_dataset_without_rewards_is_refused_before_training(tmp_path):
     columns = {
         "observations": np.random.default_rng(0).normal(size=(200, 4)),
         "actions": np.zeros((200, 2)),
@@ -327,7 +328,7 @@ def test_a_dataset_without_rewards_is_refused_before_anything_is_trained(tmp_pat
     assert not (tmp_path / "work").exists()
 
 
-def test_whole_plans_have_no_returns():
+def test_recipe_of_whole_plans_refuses_returns():
     content = load_recipe("maze2d-umaze").model_dump()
     content["train"]["small"]["returns"] = {"discount": 0.9}
     with pytest.raises(
@@ -336,12 +337,12 @@ def test_whole_plans_have_no_returns():
         Recipe.model_validate(content)
 
 
-# acting ---------------------------------------------------------------------------------------------------------------
+# acting -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def asking(monkeypatch):
-    """The ball run's recipe, asking for the highest return with that weight."""
+    """The recipe of the ball run, guided to the highest return with that weight."""
 
     def patch(weight):
         read = RECIPE.model_copy(
@@ -353,18 +354,18 @@ def asking(monkeypatch):
 
 
 @pytest.mark.parametrize(("weight", "calls"), [(0.0, 20), (1.0, 20), (2.0, 40)])
-def test_the_weight_of_the_recipe_counts_its_network_calls(weight, calls, whole, asking):
+def test_return_weight_of_the_recipe_sets_the_network_calls(weight, calls, whole, asking):
     asking(weight)
     for method, tries in (("diffuser", 1), ("alm", 1), ("best-of-k", 8)):
         found = resolve(
             Request(task="ball-run", method=method, checkpoint=whole.path, device="cpu")
         )
-        assert found.conditions.returns == weight
-        assert found.config()["returns"] == weight
+        assert found.preset.sampler.return_weight == weight
+        assert found.record()["preset"]["sampler"]["return_weight"] == weight
         assert controller(found).calls == tries * calls
 
 
-def test_plans_are_asked_for_the_most_by_every_method_and_preset(whole, asking):
+def test_every_method_and_preset_plans_for_the_highest_return(whole, asking):
     asking(2.0)
     x = torch.randn(3, 16, 4, generator=generator(0))
     wanted = guided(whole.net, 2.0, whole.limit)(x, 5)
@@ -379,19 +380,19 @@ def test_plans_are_asked_for_the_most_by_every_method_and_preset(whole, asking):
                 task="ball-run", method=method, preset=preset, checkpoint=whole.path, device="cpu"
             )
         )
-        assert torch.equal(controller(found).denoiser(x, 5), wanted)
+        assert torch.equal(controller(found).planner.denoiser(x, 5), wanted)
 
 
-def test_a_checkpoint_that_knows_no_returns_is_asked_for_none(asking):
+def test_checkpoint_without_return_labels_is_not_guided(asking):
     asking(2.0)
     found = resolve(Request(task="ball-run", device="cpu"))
-    assert found.conditions.returns == 0.0
+    assert found.preset.sampler.return_weight == 0.0
     assert controller(found).calls == 20
 
 
-def test_conditional_asks_for_what_obeys_and_not_for_returns(asking, whole):
+def test_conditional_method_uses_the_constraint_label_not_the_return(asking, whole):
     asking(2.0)
     found = resolve(
         Request(task="ball-run", method="conditional", checkpoint=whole.path, device="cpu")
     )
-    assert found.conditions.returns == 0.0
+    assert found.preset.sampler.return_weight == 0.0

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from cdiff_cli.constraints.barrier import DiscreteBarrier
 from cdiff_cli.constraints.dynamics import LinearDynamics, LinearDynamicsConstraint
 from cdiff_cli.constraints.hocbf import second_order
+from cdiff_cli.constraints.protocol import StateSet
 from cdiff_cli.constraints.rate import RateLimit, rate_bounds
 from cdiff_cli.constraints.spec.sets import (
     Coordinates,
@@ -27,17 +28,15 @@ from cdiff_cli.constraints.spec.sets import (
     observed_or_not,
     vector,
 )
-from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, StateSet
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace
 from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.yaml_files import Strict
 
-DYNAMICS_TOLERANCE = (
-    1e-5  # of a step against the dynamics, environment units: the rounding of float32 plans
-)
+DYNAMICS_TOLERANCE = 1e-5  # [env units] largest miss of a step: the rounding of float32 plans
 
 
 class LookAhead(Strict):
-    """The barrier looks ahead by `time`: psi = h + time dh/dt, or h of the place that the velocity leads to, h(p + time v)."""
+    """The barrier looks ahead by `time`: psi = h + time dh/dt, or h(p + time v)."""
 
     time: Annotated[PositiveNumber, Field(description="seconds")]
     form: Annotated[
@@ -50,27 +49,33 @@ class LookAhead(Strict):
 
 
 class Dcbf(Strict):
-    """Discrete control barrier function along the plan: h(x') >= (1 - alpha) h(x), h >= 0 safe, h = -g of the barrier.
+    """Discrete control barrier function along the plan: h(x') >= (1 - alpha) h(x), h = -g.
 
-    A plan that begins with h >= 0 keeps h >= 0 at every waypoint; one that begins with h < 0 loses at least the share alpha of
-    what is missing in each step. An executed step keeps the promise only where the input can change h at the next waypoint:
-    where it moves velocities and h asks for positions (relative degree 2), one of two options makes it reach:
+    A state is safe where h >= 0. A plan that starts with h >= 0 keeps h >= 0 at every waypoint. A
+    plan that starts with h < 0 recovers at least the share alpha of what is missing per step. An
+    executed step satisfies this only where the input can change h at the next waypoint. If the
+    input changes velocities and h depends on positions (relative degree 2), one of two options is
+    needed:
 
-    order: 2      psi(x) = h(x') - (1 - alpha) h(x), psi(x') >= (1 - alpha2) psi(x): a high-order barrier (Xiong et al., 2022, IEEE
-                  Transactions on Cybernetics). Keeps h >= 0 where the plan begins with h >= 0 and psi >= 0. Of a plan that begins
-                  with psi < 0 it asks that psi recovers; h may fall below 0 meanwhile.
-    look_ahead    another barrier in the place of h, which an input changes at once; an observed velocity leads the obstacle on too:
-        form: rate    psi = h + time dh/dt. While psi >= 0, h(t) >= h(0) e^(-t / time): what starts safe stays safe (a high-order
-                      barrier; Xiao and Belta, 2019), in continuous time and for a plan executed exactly
-        form: place   h(p + time v), never below psi. Keeps that >= 0; p itself is an average of the places it was led to
-                      (p' = p + dt v, dt <= time): it stays within a convex safe set, and round an obstacle may cut the corner
+    order: 2      psi(x) = h(x') - (1 - alpha) h(x), psi(x') >= (1 - alpha2) psi(x): a high-order
+                  barrier (Xiong et al., 2022, IEEE Transactions on Cybernetics). It keeps h >= 0
+                  where the plan starts with h >= 0 and psi >= 0. In a plan that starts with psi
+                  below 0, psi recovers, and h may fall below 0 in the meantime.
+    look_ahead    a barrier in the place of h that an input changes at once; the obstacle moves on
+                  with its observed velocity too
+        form: rate    psi = h + time dh/dt. While psi >= 0, h(t) >= h(0) e^(-t / time): a safe start
+                      stays safe (a high-order barrier; Xiao and Belta, 2019), in continuous time
+                      and for a plan that is executed exactly.
+        form: place   h(p + time v) >= 0, which is never below psi. p itself is an average of such
+                      places (p' = p + dt v, dt <= time): it stays within a convex safe set, and may
+                      cut the corner around an obstacle.
     """
 
     kind: Literal["dcbf"]
     name: str = ""
     safety: Safety = None
     alpha: Annotated[
-        float, Field(strict=True, gt=0, le=1, description="share of h that a step may use up")
+        float, Field(strict=True, gt=0, le=1, description="share of h that a step may lose")
     ]
     order: Annotated[
         Literal[1, 2],
@@ -82,7 +87,7 @@ class Dcbf(Strict):
             strict=True,
             gt=0,
             le=1,
-            description="of order 2, share of psi that a step may use up; default: alpha",
+            description="of order 2: share of psi that a step may lose; default: alpha",
         ),
     ] = None
     look_ahead: LookAhead | None = None
@@ -96,42 +101,42 @@ class Dcbf(Strict):
             raise ValueError("`alpha2` belongs to `order: 2`; add that, or leave it out")
         if self.barrier.velocity is not None or self.barrier.hold is not None:
             raise ValueError(
-                "`velocity` and `hold` of a barrier stand beside it, not in it; move them out of `barrier`"
+                "`velocity` and `hold` of a barrier stand beside it, not in it; move them out of"
+                " `barrier`"
             )
         check_velocity(self.velocity, self.barrier)
         if self.look_ahead is not None:
-            if isinstance(self.barrier, Quadratic) and (
-                self.barrier.P is not None or self.barrier.form != "distance"
-            ):
-                raise ValueError(
-                    "`look_ahead` takes a linear barrier or a quadratic one of `form: distance`"
-                )
-            round_ = isinstance(self.barrier, Quadratic) and (
-                self.barrier.radius is None or self.barrier.side == "inside"
-            )
-            if round_ and self.look_ahead.form == "rate":
-                raise ValueError(
-                    "`look_ahead` of `form: rate` takes a linear barrier or the outside of a ball; try `form: place`"
-                )
-            rates, own = (
-                self.look_ahead.velocity,
-                dict.fromkeys(name for _, name in self.barrier.coordinates()),
-            )
-            if (
-                set(rates) != set(own)
-                or len(set(rates.values())) < len(rates)
-                or set(rates.values()) & set(own)
-            ):
-                raise ValueError(
-                    f"`look_ahead.velocity` must name a rate of its own for each of {', '.join(own)}"
-                )
+            self._check_look_ahead(self.look_ahead)
         return self
+
+    def _check_look_ahead(self, look_ahead: LookAhead) -> None:
+        barrier = self.barrier
+        quadratic = barrier if isinstance(barrier, Quadratic) else None
+        if quadratic is not None and (quadratic.P is not None or quadratic.form != "distance"):
+            raise ValueError(
+                "`look_ahead` takes a linear barrier or a quadratic one of `form: distance`"
+            )
+        outside_ball = quadratic is None or (
+            quadratic.radius is not None and quadratic.side == "outside"
+        )
+        if not outside_ball and look_ahead.form == "rate":
+            raise ValueError(
+                "`look_ahead` of `form: rate` takes a linear barrier or the outside of a ball; try"
+                " `form: place`"
+            )
+        rates = look_ahead.velocity
+        names = dict.fromkeys(name for _, name in barrier.coordinates())
+        distinct = len(set(rates.values())) == len(rates)
+        if set(rates) != set(names) or not distinct or set(rates.values()) & set(names):
+            raise ValueError(
+                f"`look_ahead.velocity` must name a rate of its own for each of {', '.join(names)}"
+            )
 
     def coordinates(self) -> Iterator[tuple[Location, str]]:
         yield from ((("barrier", *location), name) for location, name in self.barrier.coordinates())
         yield from ((("velocity", name), name) for name in self.velocity or {})
         for name, rate in (self.look_ahead.velocity if self.look_ahead else {}).items():
-            yield from ((("look_ahead", "velocity", name), each) for each in (name, rate))
+            yield from ((("look_ahead", "velocity", name), one) for one in (name, rate))
 
     def observes(self) -> Iterator[tuple[Location, str]]:
         """Where the name of an observed quantity stands."""
@@ -140,20 +145,21 @@ class Dcbf(Strict):
 
     def compile(self, layout: Layout) -> TrajectoryConstraint:
         return observed_or_not(
-            self.name, self.barrier, self.velocity, self.hold, layout, self._chain
+            self.name, self.barrier, self.velocity, self.hold, layout, self._barrier
         )
 
-    def _chain(self, at: Callable[[float], StateSet], layout: Layout) -> TrajectoryConstraint:
+    def _barrier(self, at: Callable[[float], StateSet], layout: Layout) -> TrajectoryConstraint:
         alpha2 = None if self.order == 1 else self.alpha2 or self.alpha
         if self.look_ahead is None:
             return DiscreteBarrier(self.name, at(0.0), self.alpha, alpha2)
-        led = torch.eye(len(layout), dtype=torch.float64)
+        later_state = torch.eye(len(layout), dtype=torch.float64)
         for name, rate in self.look_ahead.velocity.items():
-            led[layout.index(name), layout.index(rate)] = self.look_ahead.time
+            later_state[layout.index(name), layout.index(rate)] = self.look_ahead.time
         level, later = at(0.0), cast(HalfSpace | Ellipsoid, at(self.look_ahead.time))
         if isinstance(later, HalfSpace) or self.look_ahead.form == "place":
-            return DiscreteBarrier(self.name, level, self.alpha, alpha2, later.compose(led))
-        ahead = second_order(cast(Ellipsoid, level), later.centre, led, self.look_ahead.time)
+            return DiscreteBarrier(self.name, level, self.alpha, alpha2, later.compose(later_state))
+        ball, time = cast(Ellipsoid, level), self.look_ahead.time
+        ahead = second_order(ball, later.centre, later_state, time)
         return DiscreteBarrier(self.name, level, self.alpha, alpha2, ahead)
 
     def describe(self) -> str:
@@ -169,24 +175,28 @@ class Dcbf(Strict):
                 if lead.form == "rate"
                 else f" in {lead.time:g} s at the present velocity"
             )
-        return f"{rule}, h >= 0 where {self.barrier.describe()}{ahead}{moves(self.velocity, self.hold)}"
+        moving = moves(self.velocity, self.hold)
+        return f"{rule}, h >= 0 where {self.barrier.describe()}{ahead}{moving}"
 
 
 class Dynamics(Strict):
-    """Every step is one that x' = A x + B u + c makes with bounded inputs u: given here, or fitted to the demonstrations."""
+    """Every step satisfies x' = A x + B u + c with bounded inputs u.
+
+    The dynamics are given, or fitted to the demonstrations.
+    """
 
     kind: Literal["dynamics"]
     name: str = ""
     fit: Annotated[
         Literal["demonstrations"] | None,
-        Field(description="take the dynamics that the checkpoint was fitted"),
+        Field(description="use the dynamics that training fitted to the demonstrations"),
     ] = None
     A: Annotated[
         dict[str, Coordinates] | None,
-        Field(description="row by coordinate x', column by coordinate x"),
+        Field(description="row per coordinate x', column per coordinate x"),
     ] = None
     B: Annotated[
-        dict[str, Coordinates] | None, Field(description="row by coordinate x', column by input")
+        dict[str, Coordinates] | None, Field(description="row per coordinate x', column per input")
     ] = None
     c: Coordinates | None = None
     inputs: Annotated[
@@ -194,7 +204,7 @@ class Dynamics(Strict):
         Field(description="lowest and highest value of each input"),
     ] = None
     tolerance: Annotated[
-        PositiveNumber, Field(description="of the largest miss of a step, its own units")
+        PositiveNumber, Field(description="largest miss of a step, environment units")
     ] = DYNAMICS_TOLERANCE
 
     @model_validator(mode="after")
@@ -202,7 +212,8 @@ class Dynamics(Strict):
         given = (self.A, self.B, self.inputs)
         if self.fit and any(part is not None for part in (*given, self.c)):
             raise ValueError(
-                "found both `fit` and matrices; give either `fit: demonstrations`, or A, B and inputs"
+                "found both `fit` and matrices; give either `fit: demonstrations`, or A, B and"
+                " inputs"
             )
         if not self.fit and any(part is None for part in given):
             raise ValueError("expected `fit: demonstrations`, or A, B and inputs")
@@ -227,7 +238,7 @@ class Dynamics(Strict):
         name: str,
         tolerance: float = DYNAMICS_TOLERANCE,
     ) -> "Dynamics":
-        """The kind that gives these dynamics."""
+        """The kind with these dynamics."""
         inputs = [f"u{i}" for i in range(dynamics.B.shape[1])]
         return cls(
             kind="dynamics",
@@ -274,33 +285,35 @@ class Dynamics(Strict):
 
     def describe(self) -> str:
         if self.fit:
-            return "each step obeys the dynamics fitted to the demonstrations"
+            return "each step satisfies the dynamics fitted to the demonstrations"
         bounds = ", ".join(
             f"{low:g} <= {name} <= {high:g}" for name, (low, high) in (self.inputs or {}).items()
         )
-        return f"each step obeys x' = A x + B u + c, {bounds}"
+        return f"each step satisfies x' = A x + B u + c, {bounds}"
 
 
 class RateSpec(Strict):
-    """How fast coordinates may change from a waypoint to the next, in their units a second; the same all along the segment.
+    """How fast coordinates may change from a waypoint to the next, in their units per second.
 
-    of: [x, y]   a list: the length of their change together, a second, is at most `max`
-    of: vx       one name: its change a second, with its sign, lies within `min` and `max`, of which one may be left out
+    The rate is constant along a segment.
+
+    of: [x, y]   a list: the length of the rate of these coordinates together is at most `max`
+    of: vx       one name: its signed rate is between `min` and `max`; one of them may be left out
     """
 
     kind: Literal["rate"]
     name: str = ""
     of: Annotated[
         str | Annotated[list[str], Field(min_length=1)],
-        Field(description="a list: the length of the change; a name: its signed change"),
+        Field(description="a list: the length of the rate; a name: its signed rate"),
     ]
-    min: Annotated[Number | None, Field(description="of a single coordinate, units a second")] = (
+    min: Annotated[Number | None, Field(description="of a single coordinate, units per second")] = (
         None
     )
-    max: Annotated[Number | None, Field(description="units a second")] = None
+    max: Annotated[Number | None, Field(description="units per second")] = None
     dt: Annotated[
         PositiveNumber | None,
-        Field(description="seconds between waypoints; filled in: it is the task's"),
+        Field(description="seconds between waypoints; default: those of the task"),
     ] = None
 
     @model_validator(mode="after")
@@ -316,7 +329,8 @@ class RateSpec(Strict):
             raise ValueError("`of` names a coordinate twice")
         elif self.max is None or self.max <= 0 or self.min is not None:
             raise ValueError(
-                "a list limits the length of the change: expected `max` above 0 and no `min`; name one coordinate for those"
+                "a list limits the length of the change: expected `max` above 0 and no `min`; name"
+                " one coordinate for those"
             )
         return self
 
@@ -327,7 +341,7 @@ class RateSpec(Strict):
             yield from ((("of", i), name) for i, name in enumerate(self.of))
 
     def compile(self, layout: Layout) -> TrajectoryConstraint:
-        assert self.dt is not None, "the task's, see load_constraints"
+        assert self.dt is not None, "load_constraints fills in the task's dt"
         names = [self.of] if isinstance(self.of, str) else self.of
         which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
         one = torch.ones(len(layout), dtype=torch.float64)
@@ -345,6 +359,7 @@ class RateSpec(Strict):
 
     def describe(self) -> str:
         if not isinstance(self.of, str):
-            return f"|change of {', '.join(self.of)}| <= {self.max:g} a second between waypoints"
-        low, high = ("" if v is None else f"{v:g}" for v in (self.min, self.max))
-        return f"{low}{' <= ' if low else ''}change of {self.of}{' <= ' if high else ''}{high} a second between waypoints"
+            return f"|rate of {', '.join(self.of)}| <= {self.max:g} per second between waypoints"
+        low = "" if self.min is None else f"{self.min:g} <= "
+        high = "" if self.max is None else f" <= {self.max:g}"
+        return f"{low}rate of {self.of}{high} per second between waypoints"

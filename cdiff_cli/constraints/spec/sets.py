@@ -1,4 +1,4 @@
-"""The constraint kinds over one level, linear and quadratic: their YAML, and how their numbers, given or observed, make a level."""
+"""The constraint kinds over one state set, linear and quadratic, and their state sets."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -8,7 +8,8 @@ from pydantic import Field, PlainSerializer, WithJsonSchema, WrapValidator, mode
 from torch import Tensor
 
 from cdiff_cli.constraints.observed import Observed, ObservedValues, carried
-from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric, StateSet
+from cdiff_cli.constraints.protocol import StateSet
+from cdiff_cli.constraints.state_sets import Ellipsoid, HalfSpace, Quadric
 from cdiff_cli.constraints.trajectory import TrajectoryConstraint
 from cdiff_cli.constraints.waypoints import AtWaypoints
 from cdiff_cli.yaml_files import Strict
@@ -21,7 +22,8 @@ Coordinates = Annotated[dict[str, Number], Field(min_length=1)]
 Safety = Annotated[
     Literal["waypoints", "segments"] | None,
     Field(
-        description="where it must hold: at waypoints, or all along the straight segments between them; default: the preset's"
+        description="where it must hold: at waypoints, or all along the straight segments between"
+        " them; default: the preset's"
     ),
 ]
 _AS_IT_IS = PlainSerializer(lambda value: value, return_type=float | str)
@@ -37,7 +39,7 @@ def _schema(**number: Any) -> WithJsonSchema:
 
 
 Quantity = Annotated[Number, WrapValidator(_or_name), _AS_IT_IS, _schema()]
-"""A number, or the name of an observed quantity: text, until it is observed."""
+"""A number, or the name of an observed quantity."""
 PositiveQuantity = Annotated[
     PositiveNumber, WrapValidator(_or_name), _AS_IT_IS, _schema(exclusiveMinimum=0)
 ]
@@ -45,12 +47,13 @@ Quantities = Annotated[dict[str, Quantity], Field(min_length=1)]
 Velocity = Annotated[
     Quantities | None,
     Field(
-        description="rate of change of each coordinate of the set, a second: how it moves on over the plan's waypoints"
+        description="rate of change of each coordinate of the set, per second, over the waypoints"
+        " of the plan"
     ),
 ]
 Hold = Annotated[
     bool | None,
-    Field(description="true: the set is taken to stay where it is observed, whatever its velocity"),
+    Field(description="true: the set stays where it is observed, whatever its velocity"),
 ]
 NOTHING: ObservedValues = {}
 
@@ -73,7 +76,8 @@ class Linear(Strict):
     def _not_zero(self) -> "Linear":
         if not any(self.a.values()):
             raise ValueError(
-                "all coefficients are 0, so the constraint restricts nothing; give at least one that is not"
+                "all coefficients are 0, so the constraint restricts nothing; give at least one"
+                " that is not"
             )
         check_velocity(self.velocity, self)
         return self
@@ -82,11 +86,11 @@ class Linear(Strict):
         yield from ((("a", name), name) for name in self.a)
 
     def observes(self) -> Iterator[tuple[Location, str]]:
-        """Where the name of an observed quantity stands."""
+        """The names of observed quantities, and where they stand."""
         yield from names_in({"a": self.a, "b": self.b, "velocity": self.velocity})
 
-    def level(self, layout: Layout, seen: ObservedValues = NOTHING) -> StateSet:
-        return HalfSpace(vector(self.a, layout, seen), _filled(self.b, seen))
+    def level(self, layout: Layout, observed: ObservedValues = NOTHING) -> StateSet:
+        return HalfSpace(vector(self.a, layout, observed), _filled(self.b, observed))
 
     def compile(self, layout: Layout) -> TrajectoryConstraint:
         return observed_or_not(
@@ -103,9 +107,9 @@ class Linear(Strict):
 
 
 class Quadratic(Strict):
-    """Inside or outside a ball (centre, radius), an ellipsoid (centre, semi_axes), or x.P x + q.x = r.
+    """Inside or outside a ball (centre, radius), ellipsoid (centre, semi_axes), or x.P x + q.x = r.
 
-    form distance: the signed distance to the ball's surface (for an ellipsoid a lower bound of it), metres.
+    form distance: signed distance to the ball's surface, metres; a lower bound for an ellipsoid.
     form squared:  radius^2 - |x - centre|^2 and the like, square metres.
     """
 
@@ -129,7 +133,8 @@ class Quadratic(Strict):
         round_ = self.centre is not None or self.radius is not None or self.semi_axes is not None
         if general and round_:
             raise ValueError(
-                "found both a centre and P, q, r; give either centre and radius (or semi_axes), or P, q, r"
+                "found both a centre and P, q, r; give either centre and radius (or semi_axes), or"
+                " P, q, r"
             )
         if general and (self.P is None or self.r is None):
             raise ValueError(
@@ -154,7 +159,7 @@ class Quadratic(Strict):
             yield from ((("P", row, name), name) for name in columns)
 
     def observes(self) -> Iterator[tuple[Location, str]]:
-        """Where the name of an observed quantity stands."""
+        """The names of observed quantities, and where they stand."""
         yield from names_in(
             {
                 field: getattr(self, field)
@@ -162,26 +167,26 @@ class Quadratic(Strict):
             }
         )
 
-    def level(self, layout: Layout, seen: ObservedValues = NOTHING) -> StateSet:
-        side = 1 if self.side == "outside" else -1
+    def level(self, layout: Layout, observed: ObservedValues = NOTHING) -> StateSet:
+        sign = 1 if self.side == "outside" else -1
         if self.P is not None:
             assert self.r is not None
             P = torch.stack([vector(self.P.get(row, {}), layout) for row in layout])
             return Quadric(
-                -side * (P + P.T) / 2,
-                -side * vector(self.q or {}, layout, seen),
-                -side * _filled(self.r, seen),
+                -sign * (P + P.T) / 2,
+                -sign * vector(self.q or {}, layout, observed),
+                -sign * _filled(self.r, observed),
             )
         assert self.centre is not None
         names = [name for name in layout if name in self.centre]
         lengths = {name: self.semi_axes[name] if self.semi_axes else self.radius for name in names}
-        axes, centre = vector(lengths, names, seen), vector(self.centre, names, seen)
+        axes, centre = vector(lengths, names, observed), vector(self.centre, names, observed)
         which = torch.eye(len(layout), dtype=torch.float64)[[layout.index(name) for name in names]]
         m = axes.amin(-1)
         if self.form == "distance":
-            return Ellipsoid(which, centre, axes, m, side)
+            return Ellipsoid(which, centre, axes, m, self.side)
         around = Quadric(
-            -side * which.T @ which, torch.zeros(len(layout), dtype=torch.float64), -side * m**2
+            -sign * which.T @ which, torch.zeros(len(layout), dtype=torch.float64), -sign * m**2
         )  # m^2 - |x|^2
         to_ball = m[..., None] / axes
         return around.pull_back(-(centre * to_ball) @ which, to_ball @ which + (1 - which.sum(0)))
@@ -202,7 +207,9 @@ class Quadratic(Strict):
                 f"{v:g} {a} {b}" for a, row in self.P.items() for b, v in row.items()
             )
             linear = f" + {added(self.q)}" if self.q else ""
-            return f"{square}{linear} {'>=' if self.side == 'outside' else '<='} {shown(self.r)}{moves(self.velocity, self.hold)}"
+            relation = ">=" if self.side == "outside" else "<="
+            moving = moves(self.velocity, self.hold)
+            return f"{square}{linear} {relation} {shown(self.r)}{moving}"
         centre = ", ".join(
             f"{name} = {shown(value)}" for name, value in (self.centre or {}).items()
         )
@@ -211,8 +218,9 @@ class Quadratic(Strict):
             if self.radius
             else "semi-axes " + added(self.semi_axes or {}).replace(" + ", ", ")
         )
-        ball = f"{self.side} the {'ball' if self.radius else 'ellipsoid'} at {centre}, {size} ({self.form})"
-        return ball + moves(self.velocity, self.hold)
+        shape = "ball" if self.radius else "ellipsoid"
+        moving = moves(self.velocity, self.hold)
+        return f"{self.side} the {shape} at {centre}, {size} ({self.form}){moving}"
 
 
 def observed_or_not(
@@ -223,43 +231,47 @@ def observed_or_not(
     layout: Layout,
     part: Callable[[Callable[[float], StateSet], Layout], TrajectoryConstraint],
 ) -> TrajectoryConstraint:
-    """part(at, layout), at(time) being the level of the shape `time` seconds further than each waypoint; where the shape has
-    observed quantities, the part that waits for them.
+    """The part of a shape; an Observed part where the shape has observed quantities.
+
+    part   (at, layout) -> the part, with at(time) the state set `time` seconds after each waypoint
     """
     velocity = None if hold else velocity
-    own = [seen for location, seen in shape.observes() if location[0] != "velocity"]
-    names = tuple(dict.fromkeys((*own, *(seen for _, seen in names_in(velocity or {})))))
+    observed = [name for location, name in shape.observes() if location[0] != "velocity"]
+    observed += [name for _, name in names_in(velocity or {})]
+    names = tuple(dict.fromkeys(observed))
     if not names:
         return part(lambda _: shape.level(layout), layout)
 
-    def make(seen: ObservedValues, dt: float, horizon: int) -> TrajectoryConstraint:
-        level = shape.level(layout, seen)
+    def make(observed: ObservedValues, dt: float, horizon: int) -> TrajectoryConstraint:
+        level = shape.level(layout, observed)
         if velocity is None:
             return part(lambda _: level, layout)
-        rate = vector(velocity, layout, seen)
+        rate = vector(velocity, layout, observed)
         return part(lambda time: carried(level, rate, dt, horizon, time), layout)
 
     return Observed(name, names, make)
 
 
 def check_velocity(velocity: Mapping[str, float | str] | None, shape: Linear | Quadratic) -> None:
-    """Refuse a velocity of what does not move."""
+    """Raise ValueError for a velocity of foreign coordinates, or of a set that does not move."""
     if velocity is None:
         return
-    own = dict.fromkeys(name for _, name in shape.coordinates())
-    foreign = [name for name in velocity if name not in own]
+    coordinates = dict.fromkeys(name for _, name in shape.coordinates())
+    foreign = [name for name in velocity if name not in coordinates]
     if foreign:
         raise ValueError(
-            f'`velocity` moves "{foreign[0]}", on which the set does not depend; it has {", ".join(own)}'
+            f'`velocity` moves "{foreign[0]}", on which the set does not depend; it has'
+            f" {', '.join(coordinates)}"
         )
     if not any(location[0] != "velocity" for location, _ in shape.observes()):
         raise ValueError(
-            "`velocity` says how an observed set moves on, and nothing here is observed; leave it out"
+            "`velocity` says how an observed set moves on, and nothing here is observed; leave it"
+            " out"
         )
 
 
 def names_in(numbers: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
-    """The names of observed quantities among these numbers and tables of numbers, and where they stand."""
+    """The names of observed quantities among numbers and tables, and where they stand."""
     for field, value in numbers.items():
         if isinstance(value, str):
             yield (field,), value
@@ -267,20 +279,23 @@ def names_in(numbers: Mapping[str, Any]) -> Iterator[tuple[Location, str]]:
             yield from (((field, *inner), name) for inner, name in names_in(value))
 
 
-def vector(values: Mapping[str, Any], layout: Layout, seen: ObservedValues = NOTHING) -> Tensor:
-    """The numbers in the layout's order, 0 where there is none: [dim], or [batch, 1, dim] where some are observed."""
-    wanted = [values.get(name, 0.0) for name in layout]
-    if not any(isinstance(value, str) for value in wanted):
-        return torch.tensor(wanted, dtype=torch.float64)
-    numbers = [_filled(value, seen) for value in wanted]
+def vector(values: Mapping[str, Any], layout: Layout, observed: ObservedValues = NOTHING) -> Tensor:
+    """The numbers in the layout's order, 0 where there is none.
+
+    [dim], or [batch, 1, dim] where some are observed
+    """
+    ordered = [values.get(name, 0.0) for name in layout]
+    if not any(isinstance(value, str) for value in ordered):
+        return torch.tensor(ordered, dtype=torch.float64)
+    numbers = [_filled(value, observed) for value in ordered]
     shape = max((number.shape for number in numbers), key=len)
     return torch.stack([number.expand(shape) for number in numbers], -1)
 
 
-def _filled(value: float | str, seen: ObservedValues) -> Tensor:
-    """A number as a tensor, [] or, observed, [batch, 1]."""
+def _filled(value: float | str, observed: ObservedValues) -> Tensor:
+    """A number as a tensor: [], or [batch, 1] if it is observed."""
     return (
-        seen[value].double()[:, None]
+        observed[value].double()[:, None]
         if isinstance(value, str)
         else torch.tensor(value, dtype=torch.float64)
     )
@@ -295,11 +310,11 @@ def shown(value: float | str | None) -> str:
 
 
 def moves(velocity: Mapping[str, float | str] | None, hold: bool | None) -> str:
-    """', moving by ...' or nothing."""
+    """', moving on at ...', or nothing for a fixed set."""
     if velocity is None:
         return ""
     return (
         ", held where it is observed"
         if hold
-        else f", moving on at {added(velocity).replace(' + ', ', ')} a second"
+        else f", moving on at {added(velocity).replace(' + ', ', ')} per second"
     )

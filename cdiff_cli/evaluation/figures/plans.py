@@ -181,8 +181,8 @@ def _values_in_plane(
     grid = np.zeros((*xs.shape, len(task.layout)))
     grid[..., columns[0]], grid[..., columns[1]] = xs, ys
     for part in g.parts:
-        if _in_plane(part, task):
-            yield xs, ys, part.level(torch.from_numpy(grid)).numpy()  # type: ignore[attr-defined]
+        if (level := part.level) is not None and _in_plane(part, task):
+            yield xs, ys, level(torch.from_numpy(grid)).numpy()
 
 
 def _draw_timed(axis: Any, paths: Array) -> None:

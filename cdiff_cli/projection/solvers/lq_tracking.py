@@ -1,11 +1,14 @@
-"""Linear-quadratic tracking by pieces: the matrix that turns linear costs on a trajectory into the trajectory they ask for.
+"""Linear-quadratic tracking: the matrix that maps linear costs on a trajectory to its minimiser.
 
-    minimise over w = (x, u)   sum |x - z|^2_W / 2 - f.w    s.t.  x' = A x + B u + c,  x^0 given,  the last state given or free
+    minimise over w = (x, u)   sum |x - z|^2_W / 2 - f.w
+    s.t.   x' = A x + B u + c,   x^0 given,   the last state given or free
 
-Its solution is affine in z, f and the pinned states; K = dw / df depends on the dynamics, W and the horizon alone and is shared by
-the batch. K is also the covariance of the closed loop that the Riccati recursion gives, driven by noise (Rauch, Tung and Striebel,
-1965, in reverse), and so has low rank between any two stretches of the horizon: the past acts on the future through the state
-where they meet. Held as one dense block per PIECE steps and what passes between pieces, a product with it is linear in the horizon.
+The solution is affine in z, f and the pinned states. K = dw / df depends on the dynamics, W and the
+horizon alone, and is shared by the batch. K is also the covariance of the closed loop that the
+Riccati recursion gives, driven by noise (Rauch, Tung and Striebel, 1965, in reverse). It therefore
+has low rank between any two stretches of the horizon: the past acts on the future through the state
+where they meet. K is stored as one dense block per PIECE steps and a low-rank part between pieces,
+so a product with it is linear in the horizon.
 """
 
 from collections.abc import Sequence
@@ -15,18 +18,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-PIECE = 32  # steps in a dense block
-RIDGE = 1e-9  # on the inputs, relative: where several inputs have the same effect the smallest are taken
-UNREACHED = 1e-10  # share of the largest variance of the last state below which a direction counts as out of the inputs' reach
+PIECE = 32  # steps per dense block
+RIDGE = 1e-9  # relative cost of the inputs; of inputs with the same effect the smallest are taken
+UNREACHABLE = (
+    1e-10  # share of the largest variance of the last state below which inputs do not reach
+)
 
 
 class Tracking(NamedTuple):
-    """K = blockdiag(near) + far link far^T, over w = (x^{tau+1}, u^tau) for each step tau, padded to whole pieces.
+    """K = blockdiag(near) + far link far^T, over w = (x^{tau+1}, u^tau) per step tau.
 
-    near [pieces, p, p], far [pieces, p, 2 n], link [pieces * 2 n, pieces * 2 n], p = PIECE * (n + m)
-    from_start, from_end   a trajectory that the dynamics make, by the pinned states   [steps * (n + m), n]
-    offset                 what c adds to it   [steps * (n + m)]
-    weight                 of w in the cost   [n + m]
+    w is padded to whole pieces, and p = PIECE * (n + m).
+
+    near                   [pieces, p, p]
+    far                    [pieces, p, 2 n]
+    link                   [pieces * 2 n, pieces * 2 n]
+    from_start, from_end   a trajectory of the dynamics per pinned state   [steps * (n + m), n]
+    offset                 contribution of c to that trajectory            [steps * (n + m)]
+    weight                 weight of w in the cost                         [n + m]
     """
 
     near: Tensor
@@ -38,7 +47,10 @@ class Tracking(NamedTuple):
     weight: Tensor
 
     def solve(self, z: Tensor, f: Tensor) -> Tensor:
-        """The solution for targets z [batch, horizon, n] and costs f [batch, steps, n + m]: w, [batch, steps, n + m]."""
+        """The solution w [batch, steps, n + m].
+
+        z   targets [batch, horizon, n];  f  linear costs [batch, steps, n + m]
+        """
         start = (z[:, 0] @ self.from_start.T + z[:, -1] @ self.from_end.T + self.offset).view(
             f.shape
         )
@@ -48,7 +60,7 @@ class Tracking(NamedTuple):
         return start + self.respond(pull)
 
     def respond(self, f: Tensor) -> Tensor:
-        """K f, [batch, steps, n + m]."""
+        """The product K f [batch, steps, n + m]."""
         (pieces, p, _), (batch, steps, width) = self.near.shape, f.shape
         g = f.reshape(batch, -1)
         if pieces * p > steps * width:
@@ -60,20 +72,24 @@ class Tracking(NamedTuple):
         return out.transpose(0, 1).reshape(batch, -1)[:, : steps * width].view(f.shape)
 
     def between(self, at: Tensor, weight: Tensor) -> Tensor:
-        """c_i K c_j for rows c = sum over l of weight[l] times the unit vector of entry at[l] of w, all of one row at one step:
-        at, weight [l, batch, k] -> [batch, k, k].
+        """The products c_i K c_j of k rows c per plan [batch, k, k].
+
+        Row c is the sum over l of weight[l] times the unit vector of entry at[l] of w. All entries
+        of a row belong to one step.
+
+        at, weight   [l, batch, k]
         """
         (pieces, p, rank), (_, batch, k) = self.far.shape, at.shape
         piece = at[0] // p
         rows, ends = (
-            _weighed(
+            _weighted_sum(
                 [v.flatten(0, 1).index_select(0, one.flatten()).view(batch, k, -1) for one in at],
                 weight[..., None],
             )
             for v in (self.near, self.far)
         )
         columns = (at - piece * p)[:, :, None].expand(-1, -1, k, -1)
-        inside = _weighed([rows.gather(2, one) for one in columns], weight[:, :, None])
+        inside = _weighted_sum([rows.gather(2, one) for one in columns], weight[:, :, None])
         inside = torch.where(piece[:, :, None] == piece[:, None], inside, 0.0)
         spread = ends.new_zeros(batch, k, pieces, rank)
         spread.scatter_(2, piece[..., None, None].expand(-1, -1, 1, rank), ends[:, :, None])
@@ -81,8 +97,8 @@ class Tracking(NamedTuple):
         return inside + spread @ self.link @ spread.mT
 
 
-def _weighed(terms: Sequence[Tensor], weight: Tensor) -> Tensor:
-    """The sum of terms, each times its weight."""
+def _weighted_sum(terms: Sequence[Tensor], weight: Tensor) -> Tensor:
+    """The sum of the terms, each times its weight."""
     out = terms[0] * weight[0]
     for term, by in zip(terms[1:], weight[1:], strict=True):
         out.addcmul_(term, by)
@@ -97,103 +113,143 @@ def tracking(
     ends: bool,
     device: torch.device,
 ) -> Tracking:
-    """For A, B, c, each flattened, and the weight of each coordinate. In float64."""
+    """The shared matrix in float64.
+
+    numbers   A, B, c, each flattened
+    weight    weight per coordinate
+    ends      whether the last state is given
+    """
     n = len(weight)
     A, B, c = (torch.tensor(values, dtype=torch.float64) for values in numbers)
     A, B, W = A.view(n, n), B.view(n, -1), torch.diag(torch.tensor(weight, dtype=torch.float64))
-    m = B.shape[1]
-    ridge = (
-        RIDGE
-        * float((B.T @ W @ B).diagonal().max().clamp_min(1e-30))
-        * torch.eye(m, dtype=torch.float64)
-    )
+    largest = float((B.T @ W @ B).diagonal().max().clamp_min(1e-30))
+    ridge = RIDGE * largest * torch.eye(B.shape[1], dtype=torch.float64)
     loops, roots = _closed_loop(A, B, W, ridge, steps)
-    pieces, p = -(-steps // PIECE), PIECE * (n + m)
-    near = torch.zeros(pieces, p, p, dtype=torch.float64)
-    enter, leave = torch.zeros(2, pieces, p, n, dtype=torch.float64)
-    through = torch.zeros(pieces, n, n, dtype=torch.float64)
-    spread = torch.zeros(n, n, dtype=torch.float64)  # variance of the state where a piece begins
-    free, offset = (
-        torch.zeros(steps * (n + m), n, dtype=torch.float64),
-        torch.zeros(steps * (n + m), dtype=torch.float64),
-    )
-    state, constant = torch.eye(n, dtype=torch.float64), torch.zeros(n, dtype=torch.float64)
-    for i in range(pieces):
-        some = range(i * PIECE, min(steps, (i + 1) * PIECE))
-        noise = torch.zeros(
-            n, len(some) * m, dtype=torch.float64
-        )  # of the state, by each step's noise
-        arrive = torch.eye(
-            n, dtype=torch.float64
-        )  # of the state, by the state where the piece begins
-        driven = torch.zeros(p, len(some) * m, dtype=torch.float64)
-        for j, tau in enumerate(some):
-            row, own = j * (n + m), slice(j * m, (j + 1) * m)
-            u_noise, u_arrive, u_state, u_constant = (
-                -loops[tau] @ v for v in (noise, arrive, state, constant)
-            )
-            u_noise[:, own] += roots[tau]
-            noise, arrive, state = (
-                A @ noise + B @ u_noise,
-                A @ arrive + B @ u_arrive,
-                A @ state + B @ u_state,
-            )
-            constant = A @ constant + B @ u_constant + c
-            driven[row : row + n + m] = torch.cat((noise, u_noise))
-            enter[i, row : row + n + m] = torch.cat((arrive, u_arrive))
-            free[tau * (n + m) : (tau + 1) * (n + m)] = torch.cat((state, u_state))
-            offset[tau * (n + m) : (tau + 1) * (n + m)] = torch.cat((constant, u_constant))
-        near[i] = enter[i] @ spread @ enter[i].T + driven @ driven.T
-        leave[i] = near[i][:, row : row + n]
-        spread = near[i][row : row + n, row : row + n]
-        through[i] = arrive
-    link, from_end = _links(through), torch.zeros_like(free)
+    from_start, offset = _mean(A, B, c, loops)
+    pieces = _pieces(A, B, loops, roots)
+    link, from_end = _links(pieces.through), torch.zeros_like(from_start)
     if ends:
-        to_end = torch.zeros(
-            pieces, n, n, dtype=torch.float64
-        )  # of the last state, by the state where each piece ends
-        to_end[-1] = torch.eye(n, dtype=torch.float64)
-        for i in reversed(range(pieces - 1)):
-            to_end[i] = to_end[i + 1] @ through[i + 1]
-        known = torch.linalg.pinv(spread, hermitian=True, rtol=UNREACHED)
-        shown = to_end.transpose(1, 2).reshape(pieces * n, n)
-        blocks = link.view(pieces, 2, n, pieces, 2, n)
-        blocks[:, 1, :, :, 1] -= (shown @ known @ shown.T).view(pieces, n, pieces, n)
-        from_end = (leave @ to_end.transpose(1, 2) @ known).flatten(0, 1)[: len(free)]
-        last = slice(len(free) - n - m, len(free) - m)
+        link, from_end = _given_end(pieces, link, len(from_start))
+        last = slice(len(from_start) - n - B.shape[1], len(from_start) - B.shape[1])
         offset = offset - from_end @ offset[last]
-        free = free - from_end @ free[last]
-    far = torch.cat((enter, leave), 2)
-    heavy = torch.cat((W.diagonal(), ridge.diagonal()))
-    return Tracking(*(v.to(device) for v in (near, far, link, free, from_end, offset, heavy)))
+        from_start = from_start - from_end @ from_start[last]
+    far = torch.cat((pieces.enter, pieces.leave), 2)
+    weights = torch.cat((W.diagonal(), ridge.diagonal()))
+    matrices = (pieces.near, far, link, from_start, from_end, offset, weights)
+    return Tracking(*(v.to(device) for v in matrices))
+
+
+def _mean(A: Tensor, B: Tensor, c: Tensor, loops: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """w by the first state [steps * (n + m), n], and the contribution of c [steps * (n + m)]."""
+    n = len(A)
+    state, constant = torch.eye(n, dtype=torch.float64), torch.zeros(n, dtype=torch.float64)
+    by_state, by_constant = [], []
+    for loop in loops:
+        u_state, u_constant = -loop @ state, -loop @ constant
+        state, constant = A @ state + B @ u_state, A @ constant + B @ u_constant + c
+        by_state += [state, u_state]
+        by_constant += [constant, u_constant]
+    return torch.cat(by_state), torch.cat(by_constant)
+
+
+class Pieces(NamedTuple):
+    """The closed loop, piece by piece.
+
+    near      covariance of w within a piece                          [pieces, p, p]
+    enter     w by the state where its piece begins                   [pieces, p, n]
+    leave     covariance of w and the state where its piece ends      [pieces, p, n]
+    through   the state where a piece ends by that where it begins    [pieces, n, n]
+    spread    variance of the last state                              [n, n]
+    """
+
+    near: Tensor
+    enter: Tensor
+    leave: Tensor
+    through: Tensor
+    spread: Tensor
+
+
+def _pieces(A: Tensor, B: Tensor, loops: Sequence[Tensor], roots: Sequence[Tensor]) -> Pieces:
+    """The closed loop of the feedback `loops`, driven by noise with variance root root^T."""
+    (n, m), steps = B.shape, len(loops)
+    count, p = -(-steps // PIECE), PIECE * (n + m)
+    near = torch.zeros(count, p, p, dtype=torch.float64)
+    enter, leave = torch.zeros(2, count, p, n, dtype=torch.float64)
+    through = torch.zeros(count, n, n, dtype=torch.float64)
+    spread = torch.zeros(n, n, dtype=torch.float64)  # variance of the state where a piece begins
+    for i in range(count):
+        steps_of_piece = slice(i * PIECE, (i + 1) * PIECE)
+        arrive, driven = _piece(A, B, loops[steps_of_piece], roots[steps_of_piece])
+        rows = len(arrive)
+        enter[i, :rows] = arrive
+        noise = torch.zeros(p, driven.shape[1], dtype=torch.float64)
+        noise[:rows] = driven
+        near[i] = enter[i] @ spread @ enter[i].T + noise @ noise.T
+        end = slice(rows - n - m, rows - m)
+        leave[i], spread, through[i] = near[i][:, end], near[i][end, end], enter[i][end]
+    return Pieces(near, enter, leave, through, spread)
+
+
+def _piece(
+    A: Tensor, B: Tensor, loops: Sequence[Tensor], roots: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """w by the state where the piece begins, and by the noise of each step of the piece."""
+    n, m = B.shape
+    noise = torch.zeros(n, len(loops) * m, dtype=torch.float64)
+    arrive = torch.eye(n, dtype=torch.float64)
+    arrivals, driven = [], []
+    for j, (loop, root) in enumerate(zip(loops, roots, strict=True)):
+        u_noise, u_arrive = -loop @ noise, -loop @ arrive
+        u_noise[:, j * m : (j + 1) * m] += root
+        noise, arrive = A @ noise + B @ u_noise, A @ arrive + B @ u_arrive
+        arrivals += [arrive, u_arrive]
+        driven += [noise, u_noise]
+    return torch.cat(arrivals), torch.cat(driven)
+
+
+def _given_end(pieces: Pieces, link: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """The link conditioned on a given last state, and w by that state [size, n]."""
+    count, n, _ = pieces.through.shape
+    to_end = torch.zeros(
+        count, n, n, dtype=torch.float64
+    )  # the last state by that of a piece's end
+    to_end[-1] = torch.eye(n, dtype=torch.float64)
+    for i in reversed(range(count - 1)):
+        to_end[i] = to_end[i + 1] @ pieces.through[i + 1]
+    precision = torch.linalg.pinv(pieces.spread, hermitian=True, rtol=UNREACHABLE)
+    effect = to_end.transpose(1, 2).reshape(count * n, n)
+    blocks = link.view(count, 2, n, count, 2, n)
+    blocks[:, 1, :, :, 1] -= (effect @ precision @ effect.T).view(count, n, count, n)
+    from_end = (pieces.leave @ to_end.transpose(1, 2) @ precision).flatten(0, 1)
+    return link, from_end[:size]
 
 
 def _closed_loop(
     A: Tensor, B: Tensor, W: Tensor, ridge: Tensor, steps: int
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Feedback u = -loop x of each step by the Riccati recursion, and a root of each input's variance around it."""
+    """The feedback u = -loop x per step, and a root of the variance of the inputs."""
     P, loops, roots = W, [], []
     for _ in range(steps):
         factor = torch.linalg.cholesky(B.T @ P @ B + ridge)
         loops.append(torch.cholesky_solve(B.T @ P @ A, factor))
-        roots.append(
-            torch.linalg.solve_triangular(
-                factor, torch.eye(len(factor), dtype=factor.dtype), upper=False
-            ).T
-        )
+        one = torch.eye(len(factor), dtype=factor.dtype)
+        roots.append(torch.linalg.solve_triangular(factor, one, upper=False).T)
         closed = A - B @ loops[-1]
         P = W + closed.T @ P @ closed + loops[-1].T @ ridge @ loops[-1]
     return loops[::-1], roots[::-1]
 
 
 def _links(through: Tensor) -> Tensor:
-    """What each piece passes to later ones and, K being symmetric, they to it: in a row the state that enters, then leaves."""
+    """The transitions from each piece to all later ones, and their transposes since K is symmetric.
+
+    Per piece, the state that enters it comes first, then the state that leaves it.
+    """
     pieces, n, _ = through.shape
     link = torch.zeros(pieces, 2, n, pieces, 2, n, dtype=through.dtype)
     for j in range(pieces):
-        on = torch.eye(n, dtype=through.dtype)
+        transition = torch.eye(n, dtype=through.dtype)
         for i in range(j + 1, pieces):
-            link[i, 0, :, j, 1] = on
-            link[j, 1, :, i, 0] = on.T
-            on = through[i] @ on
+            link[i, 0, :, j, 1] = transition
+            link[j, 1, :, i, 0] = transition.T
+            transition = through[i] @ transition
     return link.view(pieces * 2 * n, -1)

@@ -1,8 +1,10 @@
-"""Linear-quadratic problems over the horizon, of other costs at each waypoint and plan: the Riccati recursion over blocks of steps.
+"""Linear-quadratic problems with costs that differ by waypoint and plan, by a Riccati recursion.
 
-    minimise over q = (x, u)   sum over waypoints of q.H q / 2 + g.q   s.t.  x' = A x + B u,  the first state zero
+    minimise over q = (x, u)   sum over waypoints of q.H q / 2 + g.q
+    s.t.   x' = A x + B u,   the first state zero
 
-The recursion runs from the last block to the first: of small matrices it is the calls that cost, and blocks save those.
+The recursion runs backwards over blocks of BLOCK steps. With matrices this small the cost is the
+number of calls, not the arithmetic.
 """
 
 from typing import NamedTuple
@@ -10,14 +12,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-BLOCK = 16  # steps
+BLOCK = 16  # steps per block
 
 
 class Blocks(NamedTuple):
-    """A horizon in blocks of steps, filled up at its end.
+    """A horizon in blocks of steps, padded at its end.
 
-    within  q of each step of a block by the state where it begins and its inputs   [BLOCK, n + m, n + BLOCK m]
-    onward  the state where the next block begins, by the same   [n, n + BLOCK m]
+    Both are matrices on the state where a block begins and the inputs of the block.
+
+    within  q of each step of the block            [BLOCK, n + m, n + BLOCK m]
+    onward  the state where the next block begins  [n, n + BLOCK m]
     """
 
     within: Tensor
@@ -25,25 +29,29 @@ class Blocks(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Of each block, the first one first: the factor of its inputs' cost, and their feedback [batch, BLOCK m, n]."""
+    """Per block, in order: the Cholesky factor of the cost of its inputs, and their feedback.
+
+    [batch, BLOCK m, BLOCK m] and [batch, BLOCK m, n]
+    """
 
     roots: list[Tensor]
     feedback: list[Tensor]
 
 
 def blocks(A: Tensor, B: Tensor) -> Blocks:
+    """The matrices of a block of x' = A x + B u."""
     n, m = B.shape
     unit = torch.eye(n + BLOCK * m, dtype=A.dtype, device=A.device)
-    state, each = unit[:n], []
+    state, within = unit[:n], []
     for k in range(BLOCK):
-        own = unit[n + k * m : n + (k + 1) * m]
-        each.append(torch.cat((state, own)))
-        state = A @ state + B @ own
-    return Blocks(torch.stack(each), state)
+        inputs = unit[n + k * m : n + (k + 1) * m]
+        within.append(torch.cat((state, inputs)))
+        state = A @ state + B @ inputs
+    return Blocks(torch.stack(within), state)
 
 
 def factor(blocks: Blocks, H: Tensor) -> Factors:
-    """H [batch, horizon, n + m, n + m], positive definite in the inputs."""
+    """The factors of the costs H [batch, horizon, n + m, n + m], positive definite in u."""
     n, (batch, horizon, width, _) = len(blocks.onward), H.shape
     more = -horizon % BLOCK
     if more:
@@ -62,17 +70,17 @@ def factor(blocks: Blocks, H: Tensor) -> Factors:
 
 
 def minimiser(blocks: Blocks, factors: Factors, g: Tensor) -> Tensor:
-    """q, for g of its shape [batch, horizon, n + m]."""
+    """The minimiser q for the costs g, both [batch, horizon, n + m]."""
     n, (batch, horizon, width) = len(blocks.onward), g.shape
     more = -horizon % BLOCK
     g = torch.nn.functional.pad(g, (0, 0, 0, more)).view(batch, -1, BLOCK * width)
-    whole, own, p = (g @ blocks.within.flatten(0, 1)).unbind(1), [], g.new_zeros(batch, n)
+    whole, pushes, p = (g @ blocks.within.flatten(0, 1)).unbind(1), [], g.new_zeros(batch, n)
     for block, root, feedback in zip(*(reversed(v) for v in (whole, *factors)), strict=True):
         cost = block + p @ blocks.onward
-        own.append(-torch.cholesky_solve(cost[:, n:, None], root)[..., 0])
+        pushes.append(-torch.cholesky_solve(cost[:, n:, None], root)[..., 0])
         p = cost[:, :n] + (cost[:, None, n:] @ feedback)[:, 0]
     state, out = torch.zeros_like(p), []
-    for push, feedback in zip(reversed(own), factors.feedback, strict=True):
+    for push, feedback in zip(reversed(pushes), factors.feedback, strict=True):
         out.append(torch.cat((state, push + (feedback @ state[..., None])[..., 0]), 1))
         state = out[-1] @ blocks.onward.T
     return (torch.stack(out, 1) @ blocks.within.flatten(0, 1).T).view(batch, -1, width)[:, :horizon]

@@ -1,6 +1,7 @@
-"""Second-order cones {(s_0, s_1) : |s_1| <= s_0} for interior-point methods: products, scalings, the way to the boundary.
+"""Second-order cones {(s_0, s_1) : |s_1| <= s_0} for interior-point methods.
 
-Everything acts on the last dimension, s_0 first. Of length one it is a slack of a single inequality, s_0 >= 0.
+Everything acts on the last dimension, with s_0 first. A cone of length one is the slack s_0 >= 0 of
+a single inequality.
 """
 
 from typing import NamedTuple
@@ -17,13 +18,13 @@ def flip(x: Tensor) -> Tensor:
 
 
 def dot(x: Tensor, y: Tensor) -> Tensor:
-    """x.y [..., 1]: few terms are added faster one by one."""
+    """x.y [..., 1], added term by term, which is faster for few terms."""
     first, *others = torch.split(x * y, 1, -1)
     return sum(others, first)
 
 
 def determinant(s: Tensor) -> Tensor:
-    """s_0^2 - |s_1|^2 [..., 1], written so that it keeps its digits near the boundary."""
+    """s_0^2 - |s_1|^2 [..., 1], in a form that is accurate near the boundary."""
     if s.shape[-1] == 1:
         return s.square()
     first, length = s[..., :1], s[..., 1:].norm(dim=-1, keepdim=True)
@@ -31,19 +32,20 @@ def determinant(s: Tensor) -> Tensor:
 
 
 def product(s: Tensor, y: Tensor) -> Tensor:
-    """s o y = (s.y, s_0 y_1 + y_0 s_1)."""
+    """The Jordan product s o y = (s.y, s_0 y_1 + y_0 s_1)."""
     return torch.cat((dot(s, y), s[..., :1] * y[..., 1:] + y[..., :1] * s[..., 1:]), -1)
 
 
 def quotient(r: Tensor, s: Tensor) -> Tensor:
-    """x with s o x = r."""
+    """The solution x of s o x = r."""
     first = dot(flip(s), r) / determinant(s)
     return torch.cat((first, (r[..., 1:] - first * s[..., 1:]) / s[..., :1]), -1)
 
 
 class Scaling(NamedTuple):
-    """W = beta (2 v v^T - J), J = diag(1, -1, ..., -1), with W y = W^-1 s for given s and y inside the cone (Nesterov and Todd,
-    1997); W^2 = beta^2 (2 w w^T - J).
+    """W = beta (2 v v^T - J), J = diag(1, -1, ..., -1), W y = W^-1 s (Nesterov and Todd, 1997).
+
+    s and y are inside the cone, and W^2 = beta^2 (2 w w^T - J).
 
     beta [..., 1], v, w [..., k + 1]
     """
@@ -53,21 +55,22 @@ class Scaling(NamedTuple):
     w: Tensor
 
     def times(self, x: Tensor) -> Tensor:
-        """W x"""
+        """W x."""
         return self.beta * (2 * self.v * dot(self.v, x) - flip(x))
 
     def over(self, x: Tensor) -> Tensor:
-        """W^-1 x"""
+        """W^-1 x."""
         v = flip(self.v)
         return (2 * v * dot(v, x) - flip(x)) / self.beta
 
     def over_twice(self, x: Tensor) -> Tensor:
-        """W^-2 x"""
+        """W^-2 x."""
         w = flip(self.w)
         return (2 * w * dot(w, x) - flip(x)) / self.beta.square()
 
 
 def scaling(s: Tensor, y: Tensor) -> Scaling:
+    """The scaling of slacks s and multipliers y [..., k + 1]."""
     size, weight = determinant(s).sqrt(), determinant(y).sqrt()
     s, y = s / size, y / weight
     w = (s + flip(y)) / (2 + 2 * dot(s, y)).sqrt()
@@ -76,7 +79,10 @@ def scaling(s: Tensor, y: Tensor) -> Scaling:
 
 
 def way_out(s: Tensor, d: Tensor) -> Tensor:
-    """The smallest a > 0 at which s + a d leaves the cone, infinite where it never does; s inside   [...]"""
+    """The smallest a > 0 at which s + a d leaves the cone [...]; inf where it never does.
+
+    s   inside the cone
+    """
     a, c, b = determinant(d)[..., 0], determinant(s)[..., 0], dot(flip(s), d)[..., 0]
     root = (b.square() - a * c).clamp_min(0.0).sqrt()
     far = -(b + torch.where(b < 0, -root, root))

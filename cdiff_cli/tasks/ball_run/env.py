@@ -1,7 +1,9 @@
-"""`cdiff_cli/BallRun-v0`: a ball on a plane, pushed by a bounded force, rewarded for running along x past a moving obstacle.
+"""`cdiff_cli/BallRun-v0`: a ball on a plane is rewarded for running along x past a moving obstacle.
 
-Physics, reward, cost and the first seven observations are SafetyBallRun's (Bullet-Safety-Gym 1.4.0), to about 1e-5.
-`gymnasium.make("cdiff_cli.tasks.ball_run.env:cdiff_cli/BallRun-v0", pattern="chaser")`
+Physics, reward, cost and the first seven observations are those of SafetyBallRun
+(Bullet-Safety-Gym 1.4.0), to about 1e-5.
+
+    gymnasium.make("cdiff_cli.tasks.ball_run.env:cdiff_cli/BallRun-v0", pattern="chaser")
 """
 
 import contextlib
@@ -22,44 +24,51 @@ from cdiff_cli.tasks.ball_run.obstacles import PATTERNS, Motion, Vector, steady
 
 @contextlib.contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Nothing reaches file descriptor 2: pybullet's C code prints its build time at import."""
+    """Silence file descriptor 2: pybullet's C code prints its build time at import."""
     sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
 
 
 with _silent_stderr():
     import pybullet as pb
 ENV_ID = "cdiff_cli/BallRun-v0"
-DT = 4 / 120  # s, an environment step: four substeps
-FORCE = 3.5  # N a unit of action
-RADIUS = 0.5  # m, agent and obstacle alike
-MASS = 0.3  # kg
-HEAVY = 3e4  # kg, of the obstacle: pushed by the ball it changes its velocity by 1e-5 of what the ball does
-GOAL_X = 1000.0  # m, the far point the reward measures the distance to
+DT = 4 / 120  # s, environment step of four substeps
+FORCE = 3.5  # N per unit of action
+RADIUS = 0.5  # m, of the ball and the obstacle
+MASS = 0.3  # kg, of the ball
+HEAVY = 3e4  # kg, of the obstacle: a collision changes its velocity by 1e-5 of the ball's change
+GOAL_X = 1000.0  # m, x of the point from which the reward measures the distance
 MAX_STEPS = 100
-LANE, SPEED_LIMIT = 2.0, 2.5  # m and m/s: SafetyBallRun's own cost
-WIDTH, HEIGHT = 320, 240
-OBSERVED = np.array([0.1, 0.1, 0.2, 0.2])  # what SafetyBallRun multiplies (x, y, vx, vy) by
+LANE, SPEED_LIMIT = 2.0, 2.5  # m and m/s, limits of SafetyBallRun's own cost
+WIDTH, HEIGHT = 320, 240  # pixels of a picture
+OBSERVED = np.array(
+    [0.1, 0.1, 0.2, 0.2]
+)  # factors of (x, y, vx, vy) in SafetyBallRun's observation
 
 
 class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
-    """Action: force in [-1, 1]^2, along x and y. Episodes end after 100 steps by truncation alone (gymnasium.make adds that).
+    """The environment. Episodes end by truncation alone, which gymnasium.make adds.
 
-    pattern   one of obstacle.PATTERNS; "none" has no obstacle; None takes pattern number seed % 6 (reset without a seed: drawn)
-    collide   whether the obstacle pushes the ball; a ghost can be run through
+    pattern       one of obstacles.PATTERNS, or "none" for no obstacle; None: pattern number
+                  seed % 6, drawn at random if reset gets no seed
+    collide       whether the obstacle pushes the ball; otherwise the ball can run through it
 
-    Observation [0.1 x, 0.1 y, 0.2 vx, 0.2 vy, 0.1 spin(3)], with an obstacle also [0.1 x, 0.1 y, 0.2 vx, 0.2 vy] of it.
-    Reward 60 times the decrease of the distance to (1000, 0) in metres, less 0.5 |action|.
-    Info: cost (SafetyBallRun's own), contact (the balls touched during the step), contacts (steps with contact so far).
-    reset(options={"start": (x, y), "obstacle": (x, y, vx, vy)}), both optional, places the ball and sends the obstacle along a
-    straight line of its own.
+    action        force in [-1, 1]^2 along x and y
+    observation   [0.1 x, 0.1 y, 0.2 vx, 0.2 vy, 0.1 spin(3)], and with an obstacle also
+                  [0.1 x, 0.1 y, 0.2 vx, 0.2 vy] of it
+    reward        60 times the decrease of the distance to (1000, 0) in metres, minus 0.5 |action|
+    info          cost (SafetyBallRun's own), contact (whether the balls touched during the step),
+                  contacts (steps with contact so far), pattern
+
+    reset(options={"start": (x, y), "obstacle": (x, y, vx, vy)}), both optional, places the ball and
+    sends the obstacle along a straight line.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -69,7 +78,8 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
     ) -> None:
         if pattern is not None and pattern not in (*PATTERNS, "none"):
             raise CdiffError(
-                f'no pattern "{pattern}"{suggestion(pattern, PATTERNS)}; choose from {", ".join(PATTERNS)}, none'
+                f'no pattern "{pattern}"{suggestion(pattern, PATTERNS)}; '
+                f"choose from {', '.join(PATTERNS)}, none"
             )
         self.pattern, self.collide, self.render_mode = pattern, collide, render_mode
         self.playing = pattern or "none"
@@ -89,15 +99,14 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
     ) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed)
         names = tuple(PATTERNS)
-        number = int(
-            self.np_random.integers(len(names))
-        )  # always drawn: a chosen pattern must not shift what follows
+        # always drawn, so that a chosen pattern does not shift the draws that follow
+        number = int(self.np_random.integers(len(names)))
         self.playing = self.pattern or names[number if seed is None else seed % len(names)]
         given = options or {}
         start = given.get("start", self.np_random.uniform(-0.01, 0.01, 2))
         self._motion = None if self.playing == "none" else self._draw(given)
         self._steps, self.contacts = 0, 0
-        self._world()  # anew: the solver's cached impulses would carry the last episode into this one
+        self._world()  # the solver's cached impulses must not carry over into this episode
         self._place(self._ball, start)
         if self._motion is not None:
             self._where = self._motion.start
@@ -129,7 +138,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         if self._motion is not None:
             t, (x, y), (vx, vy) = DT * self._steps, self._where, self._velocity
             self._where = (x + DT * vx, y + DT * vy)
-            self._place(self._obstacle, self._where)  # to where it was sent, whatever it met
+            self._place(self._obstacle, self._where)  # its motion ignores collisions
             self._velocity = self._motion.velocity(
                 t, self._where, self._velocity, self._position[:2]
             )
@@ -137,7 +146,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         return self._observation(), reward, False, False, self._info(contact)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture [240, 320, 3] from above and behind; the camera goes with the ball."""
+        """A picture [240, 320, 3] from above and behind; the camera follows the ball."""
         if self.render_mode != "rgb_array":
             return None
         view = pb.computeViewMatrixFromYawPitchRoll(
@@ -154,7 +163,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
             self._client = -1
 
     def observed(self) -> dict[str, float]:
-        """The obstacle's present position (m) and velocity (m/s) by name; nothing where there is none."""
+        """Present position [m] and velocity [m/s] of the obstacle; empty without an obstacle."""
         if self._motion is None:
             return {}
         values = (*self._where, *self._velocity)
@@ -163,7 +172,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
             for name, value in zip(("x", "y", "vx", "vy"), values, strict=True)
         }
 
-    # the inside -------------------------------------------------------------------------------------------------------
+    # the simulation ----------------------------------------------------------------------------
 
     def _draw(self, given: Mapping[str, Any]) -> Motion:
         if "obstacle" in given:
@@ -172,7 +181,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         return PATTERNS[self.playing](self.np_random)
 
     def _world(self) -> None:
-        """An empty simulation with plane, ball and obstacle (the latter far away)."""
+        """A new simulation with plane, ball and obstacle."""
         c = {"physicsClientId": self._client}
         pb.resetSimulation(**c)
         pb.setPhysicsEngineParameter(
@@ -224,7 +233,7 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         return int(pb.createVisualShape(pb.GEOM_BOX, halfExtents=half, rgbaColor=colour, **frame))
 
     def _markings(self) -> None:
-        """Lines along y = -2 and y = 2, a stripe every 2 m: without them nothing seems to move."""
+        """Lines along y = -2 and y = 2 and a stripe every 2 m make the motion visible."""
         grey, yellow = (0.62, 0.65, 0.68, 1), (0.95, 0.65, 0.1, 1)
         stripe, line = (
             self._box((0.03, LANE, 0.005), grey, 0.0),
@@ -252,7 +261,10 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
         return float(np.hypot(self._position[0] - GOAL_X, self._position[1]))
 
     def _push_obstacle(self) -> None:
-        """Its velocity for this step, its weight carried: Bullet moves it through the substeps, and it yields to nothing."""
+        """Set the velocity of the obstacle for this step and lift its weight.
+
+        Bullet then moves it through the substeps, and the ball cannot deflect it.
+        """
         c = {"physicsClientId": self._client}
         if self.collide:
             pb.resetBaseVelocity(self._obstacle, (*self._velocity, 0), (0, 0, 0), **c)
@@ -266,14 +278,17 @@ class BallRunEnv(gymnasium.Env[Array, NDArray[np.float32]]):
             )
 
     def _in_the_way(self) -> bool:
-        """Whether the balls overlap somewhere in this step if neither feels the other (but for the 6 mm an input moves)."""
+        """Whether the balls overlap within this step if neither deflects the other.
+
+        The effect of the present input, at most 6 mm, is left out.
+        """
         d = np.subtract(self._where, self._position[:2])
         w = DT * np.subtract(self._velocity, self._twist[0][:2])
         nearest = d + w * np.clip(-(d @ w) / max(w @ w, 1e-12), 0.0, 1.0)
         return bool(nearest @ nearest < (2 * RADIUS) ** 2)
 
     def _pressed(self) -> bool:
-        """Whether they pushed each other in the last substep, the only one whose contacts Bullet keeps."""
+        """Whether the balls pushed each other in the last substep, whose contacts Bullet keeps."""
         if self._motion is None or not self.collide:
             return False
         return any(

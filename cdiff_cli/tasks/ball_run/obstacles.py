@@ -1,4 +1,4 @@
-"""A moving obstacle in the plane: six patterns of motion, each drawn from a seeded generator."""
+"""A moving obstacle in the plane: six patterns of motion, drawn from a seeded generator."""
 
 import math
 from collections.abc import Callable
@@ -10,19 +10,19 @@ from cdiff_cli.arrays import Array
 
 Vector = tuple[float, float]
 Velocity = Callable[[float, Vector, Vector, Vector], Vector]
-RUN_SPEED = 3.5  # m/s, about what the demonstrations run at: crossings are timed by it
-ACCELERATION = (
-    8.0  # m/s^2, the most a pattern that steers changes its velocity by; the agent's own is 8.2
-)
-CHASE_GAP = 0.4  # s, how far behind the start the chaser sets out, at its own speed, beyond 2 m
+RUN_SPEED = 3.5  # m/s, about the speed of the demonstrations; crossings are timed by it
+ACCELERATION = 8.0  # m/s^2, largest acceleration of patterns that steer; the agent's is 8.2
+CHASE_GAP = 0.4  # s, largest head start of the agent over the chaser, beyond 2 m
+STEP = 1 / 30  # s, environment step
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where an obstacle begins and how it goes on.
+    """Start of an obstacle, and its velocity until the next step.
 
-    start      (x, y)                                                                metres
-    velocity   of (time, obstacle's position, its velocity, agent's position), m/s: what it moves by until the next step
+    start      (x, y) [m]
+    velocity   (time [s], position and velocity of the obstacle, position of the agent) -> (vx, vy)
+               [m/s]
     """
 
     start: Vector
@@ -35,7 +35,7 @@ def steady(start: Vector, velocity: Vector) -> Motion:
 
 
 def oncoming(rng: np.random.Generator) -> Motion:
-    """Straight towards the start, a little off the line y = 0."""
+    """Straight towards the start of the agent, a little off the line y = 0."""
     return steady(
         (rng.uniform(7.0, 10.0), rng.uniform(-0.4, 0.4)),
         (-rng.uniform(0.8, 2.0), rng.uniform(-0.1, 0.1)),
@@ -43,9 +43,9 @@ def oncoming(rng: np.random.Generator) -> Motion:
 
 
 def crossing(rng: np.random.Generator) -> Motion:
-    """From one side to the other, over y = 0 at about the time an agent at RUN_SPEED comes there."""
+    """From one side to the other; it is at y = 0 about when an agent at RUN_SPEED is."""
     x, speed, side = rng.uniform(4.0, 7.5), rng.uniform(1.0, 2.5), rng.choice((-1.0, 1.0))
-    arrival = x / RUN_SPEED + 0.2 + rng.uniform(-0.25, 0.25)  # 0.2 s are lost on gathering speed
+    arrival = x / RUN_SPEED + 0.2 + rng.uniform(-0.25, 0.25)  # acceleration costs the agent 0.2 s
     return steady((x, -side * speed * arrival), (rng.uniform(-0.3, 0.3), side * speed))
 
 
@@ -65,14 +65,15 @@ def leader(rng: np.random.Generator) -> Motion:
 
 
 def circling(rng: np.random.Generator) -> Motion:
-    """Round a fixed point on the agent's way."""
+    """Around a fixed point on the way of the agent."""
     centre = (rng.uniform(4.0, 6.5), rng.uniform(-0.5, 0.5))
     radius, phase = rng.uniform(0.6, 1.4), rng.uniform(0, 2 * math.pi)
     rate = rng.choice((-1.0, 1.0)) * rng.uniform(0.8, 2.0) / radius
 
     def velocity(_t: float, o: Vector, _v: Vector, _p: Vector) -> Vector:
         dx, dy = o[0] - centre[0], o[1] - centre[1]
-        out = 2.0 * (radius / math.hypot(dx, dy) - 1.0)  # tangents alone would spiral outwards
+        # tangential steps alone would spiral outwards
+        out = 2.0 * (radius / math.hypot(dx, dy) - 1.0)
         return -rate * dy + out * dx, rate * dx + out * dy
 
     return Motion(
@@ -81,7 +82,7 @@ def circling(rng: np.random.Generator) -> Motion:
 
 
 def random_waypoint(rng: np.random.Generator) -> Motion:
-    """From point to random point across the agent's way."""
+    """From one random point to the next across the way of the agent."""
     points = [(rng.uniform(2.5, 9.0), rng.uniform(-1.8, 1.8)) for _ in range(40)]
     speeds = [rng.uniform(1.0, 2.5) for _ in points]
     start, target = points[0], 1
@@ -90,32 +91,32 @@ def random_waypoint(rng: np.random.Generator) -> Motion:
         nonlocal target
         while math.dist(points[target % len(points)], o) < 0.3:
             target += 1
-        return steer(v, towards(o, points[target % len(points)], speeds[target % len(points)]))
+        return steer(v, velocity_to(o, points[target % len(points)], speeds[target % len(points)]))
 
     return Motion(start, velocity)
 
 
 def chaser(rng: np.random.Generator) -> Motion:
-    """After the agent from behind, always turning towards where it is."""
+    """After the agent from behind, always steering towards its present position."""
     speed = rng.uniform(3.8, 5.0)
 
     def velocity(_t: float, o: Vector, v: Vector, p: Vector) -> Vector:
-        return steer(v, towards(o, p, speed))
+        return steer(v, velocity_to(o, p, speed))
 
     return Motion((-2.0 - rng.uniform(0.0, CHASE_GAP) * speed, rng.uniform(-0.8, 0.8)), velocity)
 
 
-def towards(here: Vector, there: Vector, speed: float) -> Vector:
-    """The velocity of that speed from here to there; none at all where they coincide."""
-    dx, dy = there[0] - here[0], there[1] - here[1]
+def velocity_to(point: Vector, target: Vector, speed: float) -> Vector:
+    """Velocity of that speed from a point to a target; zero if they coincide."""
+    dx, dy = target[0] - point[0], target[1] - point[1]
     distance = math.hypot(dx, dy)
     return (speed * dx / distance, speed * dy / distance) if distance > 1e-9 else (0.0, 0.0)
 
 
-def steer(v: Vector, wanted: Vector, dt: float = 1 / 30) -> Vector:
-    """The velocity nearest to the wanted one that ACCELERATION allows within one step."""
-    dx, dy = wanted[0] - v[0], wanted[1] - v[1]
-    share = min(1.0, ACCELERATION * dt / max(math.hypot(dx, dy), 1e-9))
+def steer(v: Vector, target: Vector) -> Vector:
+    """The velocity nearest to a target velocity that ACCELERATION allows within one step."""
+    dx, dy = target[0] - v[0], target[1] - v[1]
+    share = min(1.0, ACCELERATION * STEP / max(math.hypot(dx, dy), 1e-9))
     return v[0] + share * dx, v[1] + share * dy
 
 
@@ -130,14 +131,12 @@ PATTERNS: dict[str, Callable[[np.random.Generator], Motion]] = {
 
 
 def beside(motion: Motion, path: Array, dt: float) -> Array:
-    """Place and velocity of the obstacle at each step of an agent's path [n, 2], where nothing holds it up [n, 4]."""
-    where, velocity, seen = (
-        motion.start,
-        motion.velocity(0.0, motion.start, (0.0, 0.0), tuple(path[0])),
-        [],
-    )
+    """Position and velocity of a free obstacle at each step of an agent's path [n, 2]: [n, 4]."""
+    position = motion.start
+    velocity = motion.velocity(0.0, position, (0.0, 0.0), tuple(path[0]))
+    rows = [(*position, *velocity)]
     for step, agent in enumerate(path[1:].tolist(), start=1):
-        seen.append((*where, *velocity))
-        where = (where[0] + dt * velocity[0], where[1] + dt * velocity[1])
-        velocity = motion.velocity(dt * step, where, velocity, (agent[0], agent[1]))
-    return np.array([*seen, (*where, *velocity)])
+        position = (position[0] + dt * velocity[0], position[1] + dt * velocity[1])
+        velocity = motion.velocity(dt * step, position, velocity, (agent[0], agent[1]))
+        rows.append((*position, *velocity))
+    return np.array(rows)

@@ -1,12 +1,19 @@
-"""Augmented Random Search (Mania et al. 2018, V2-t) for linear gaits: python -m cdiff_cli.tasks.mujoco.gait_search hopper
+"""Augmented Random Search (Mania et al. 2018, V2-t) for linear gaits.
 
-Each iteration tries the policy perturbed by +nu d and -nu d along N random directions d, keeps the b directions with the
-largest of their two returns, and steps by alpha / (b sigma) * sum (return+ - return-) d, sigma the standard deviation of
-the 2 b returns. Observations are whitened by their running mean and deviation, which the result folds into W and b.
+    python -m cdiff_cli.tasks.mujoco.gait_search hopper
 
-A seed is searched without noise first; then, whitening frozen, under action noise; then, whitened anew by its own walk,
-under more, so that the gait does not fall where it is executed imprecisely. Each phase starts from the policy that was best
-on the selection seeds in the one before; the returns written down are of other seeds.
+Each iteration tries the policy perturbed by +nu d and -nu d along N random directions d. It keeps
+the b directions with the largest of their two returns, and adds to the policy
+
+    alpha / (b sigma) * sum (return+ - return-) d
+
+where sigma is the standard deviation of the 2 b returns. Observations are whitened by their running
+mean and deviation, which W and b of the result include.
+
+A search starts without noise. It continues under action noise with the same whitening. Then it
+continues under more noise with a new whitening from its own walks, so that an imprecisely executed
+gait does not fall. Each phase starts from the policy that was best on the selection seeds in the
+phase before. The returns in the file are those of other seeds.
 """
 
 import argparse
@@ -28,18 +35,18 @@ from cdiff_cli.tasks import load_task
 from cdiff_cli.tasks.mujoco.locomotion import Gait, Locomotion
 
 Report = Callable[[str], None]
-SELECTION = range(10_000, 10_018)
-TEST = range(20_000, 20_020)
+SELECTION = range(10_000, 10_018)  # seeds on which policies are compared
+TEST = range(20_000, 20_020)  # seeds of the returns in the file
 
 
 class Phase(NamedTuple):
-    """One stretch of a search under noise.
+    """One phase of a search.
 
-    until       environment steps at its end, since the whitening was last begun
-    noise       standard deviations of the action noise, direction by direction in turn
-    selection   those of the selection episodes, in turn
-    episodes    how many of these
-    whiten      whether to begin a new whitening, of the gait's own states
+    until       environment steps at its end, counted from the last new whitening
+    noise       standard deviations of the action noise, one per direction in turn
+    selection   standard deviations of the action noise, one per selection episode in turn
+    episodes    number of selection episodes
+    whiten      whether the phase starts with a new whitening, of the states of its gait
     """
 
     until: int
@@ -54,11 +61,12 @@ class Search:
     """Constants of the search of one task.
 
     directions, best, alpha, nu   N, b, step size and size of the perturbations
-    survival                      taken off the reward of a step: else standing still pays
-    screen, at_least              a seed that has not reached this return by so many steps is given up
-    quiet                         the phase without noise, in which observations are whitened
-    noisy                         the phases after it
-    test                          standard deviations of the action noise the returns written down are under
+    survival                      subtracted from the reward per step, so that standing still does
+                                  not pay
+    screen, at_least              steps after which a seed needs this return to go on
+    quiet                         phase without noise, in which observations are whitened
+    noisy                         phases that follow
+    test                          standard deviations of the action noise of the returns in the file
     """
 
     directions: int
@@ -74,17 +82,12 @@ class Search:
 
     def within(self, steps: int) -> "Search":
         """The same search in that many steps altogether."""
-        begun = [i for i, phase in enumerate(self.noisy) if phase.whiten]
-        ends = [(self.quiet, *self.noisy)[i].until for i in begun] + [
-            (self.quiet, *self.noisy)[-1].until
-        ]
-        share = steps / sum(ends)
-        shorter = [
-            phase._replace(until=round(phase.until * share)) for phase in (self.quiet, *self.noisy)
-        ]
-        return replace(
-            self, screen=round(self.screen * share), quiet=shorter[0], noisy=tuple(shorter[1:])
-        )
+        phases = (self.quiet, *self.noisy)
+        # a phase that whitens counts its steps from zero, so the one before it adds to the total
+        ends = [phases[i].until for i, phase in enumerate(self.noisy) if phase.whiten]
+        share = steps / (sum(ends) + phases[-1].until)
+        quiet, *noisy = (phase._replace(until=round(phase.until * share)) for phase in phases)
+        return replace(self, screen=round(self.screen * share), quiet=quiet, noisy=tuple(noisy))
 
 
 SEARCHES = {
@@ -124,28 +127,29 @@ class Whitening:
     def __init__(self, dim: int) -> None:
         self.n, self.mean, self.squares = 0, np.zeros(dim), np.zeros(dim)
 
-    def add(self, seen: Array) -> None:
+    def add(self, states: Array) -> None:
         """Chan's update by a batch [k, dim]."""
-        k, mean = len(seen), seen.mean(0)
+        k, mean = len(states), states.mean(0)
         gap = mean - self.mean
         self.squares = (
-            self.squares + ((seen - mean) ** 2).sum(0) + gap**2 * self.n * k / (self.n + k)
+            self.squares + ((states - mean) ** 2).sum(0) + gap**2 * self.n * k / (self.n + k)
         )
         self.mean = self.mean + gap * k / (self.n + k)
         self.n += k
 
     def deviation(self) -> Array:
+        """Standard deviations [dim]; ones without data."""
         return np.sqrt(self.squares / max(self.n, 1)) + 1e-8 if self.n else np.ones_like(self.mean)
 
     def fold(self, M: Array, decimals: int | None = None) -> Gait:
-        """The gait M (o - mean) / deviation in the observations themselves."""
+        """The gait M (x - mean) / deviation as a policy W x + b of the state x."""
         W = M / self.deviation()
         b = -W @ self.mean
         return Gait(W, b) if decimals is None else Gait(W.round(decimals), b.round(decimals))
 
 
 class Climb:
-    """One search: the present M, its whitening, the steps taken and the best policy so far."""
+    """A running search: the present M, its whitening, the steps so far and the best policy."""
 
     def __init__(self, task: Locomotion, search: Search, seed: int) -> None:
         self.task, self.search = task, search
@@ -157,24 +161,27 @@ class Climb:
         self.forget()
 
     def forget(self) -> None:
-        """Let the present policy be the best so far."""
+        """Make the present policy the best one."""
         self.best, self.best_score = self.whitening.fold(self.M, 4), -np.inf
         self.best_state = self.M, copy.copy(self.whitening)
 
     def whiten(self, seed: int) -> None:
-        """Start from the best gait with the deviations of its own states and a mean that gives its b back."""
-        seen: list[Array] = []
+        """Start from the best gait, with the deviations of its states; the mean keeps its b."""
+        states: list[Array] = []
         for episode in range(10):
-            self.task.walk(self.env, self.best, episode, 0.05, seen)
+            self.task.walk(self.env, self.best, episode, 0.05, states)
         self.whitening = Whitening(len(self.task.layout))
-        self.whitening.add(np.array(seen))
+        self.whitening.add(np.array(states))
         self.whitening.mean = -np.linalg.pinv(self.best.W) @ self.best.b
         self.M = self.best.W * self.whitening.deviation()
         self.rng = np.random.default_rng(seed)
         self.before, self.steps = self.before + self.steps, 0
 
     def run(self, phase: Phase, learn: bool, report: Report) -> None:
-        """Iterations up to the phase's end, the policy tested every tenth of the way."""
+        """Iterations up to the end of a phase, with a test after every tenth of it.
+
+        learn   whether the whitening is updated
+        """
         first, tested = self.steps, 0
         while self.steps < phase.until:
             self._iterate(phase.noise, learn)
@@ -182,43 +189,41 @@ class Climb:
             if tenth > tested:
                 tested = tenth
                 score = self.test(phase.selection, phase.episodes)
-                report(
-                    f"{self.before + self.steps} steps: return {score:.1f}, best {self.best_score:.1f}"
-                )
+                steps = self.before + self.steps
+                report(f"{steps} steps: return {score:.1f}, best {self.best_score:.1f}")
 
     def _iterate(self, noise: Sequence[float], learn: bool) -> None:
+        """One iteration."""
         s = self.search
-        returns, ways = np.zeros((s.directions, 2)), []
-        seen: list[Array] = []
+        returns, directions = np.zeros((s.directions, 2)), []
+        states: list[Array] | None = [] if learn else None
         for i in range(s.directions):
-            way = self.rng.standard_normal(self.M.shape)
-            ways.append(way)
+            d = self.rng.standard_normal(self.M.shape)
+            directions.append(d)
             episode = int(self.rng.integers(2**31))
             for j, sign in enumerate((1.0, -1.0)):
-                gait = self.whitening.fold(self.M + sign * s.nu * way)
-                out = self.task.walk(
-                    self.env, gait, episode, noise[i % len(noise)], seen if learn else None
-                )
-                returns[i, j] = out.reward - s.survival * out.steps
-                self.steps += out.steps
+                gait = self.whitening.fold(self.M + sign * s.nu * d)
+                outcome = self.task.walk(self.env, gait, episode, noise[i % len(noise)], states)
+                returns[i, j] = outcome.reward - s.survival * outcome.steps
+                self.steps += outcome.steps
         top = np.argsort(returns.max(1))[::-1][: s.best]
         sigma = max(float(returns[top].std()), 1e-6)
         gain = returns[top, 0] - returns[top, 1]
         self.M = self.M + s.alpha / (s.best * sigma) * sum(
-            g * ways[i] for g, i in zip(gain, top, strict=True)
+            g * directions[i] for g, i in zip(gain, top, strict=True)
         )
-        if learn:
-            self.whitening.add(np.array(seen))
+        if states is not None:
+            self.whitening.add(np.array(states))
 
     def test(self, noise: Sequence[float], episodes: int) -> float:
-        """Mean return of the rounded policy over selection episodes, the noise in turn; the best is remembered."""
+        """Mean return of the rounded policy over selection episodes; the best policy is kept."""
         gait = self.whitening.fold(self.M, 4)
-        outs = [
+        outcomes = [
             self.task.walk(self.env, gait, seed, noise[i % len(noise)])
             for i, seed in enumerate(SELECTION[:episodes])
         ]
-        self.steps += sum(out.steps for out in outs)
-        score = float(np.mean([out.reward for out in outs]))
+        self.steps += sum(outcome.steps for outcome in outcomes)
+        score = float(np.mean([outcome.reward for outcome in outcomes]))
         if score > self.best_score:
             self.best, self.best_score = gait, score
             self.best_state = self.M, copy.copy(self.whitening)
@@ -228,7 +233,7 @@ class Climb:
 def search_gait(
     task: Locomotion, search: Search, seed: int, report: Report = lambda _: None
 ) -> tuple[Gait, int] | None:
-    """The gait of a seed and the environment steps it took, or None where the seed was given up."""
+    """The gait of a seed and its environment steps; None if the seed misses `at_least`."""
     climb = Climb(task, search, seed)
     climb.run(search.quiet._replace(until=search.screen), True, report)
     if climb.best_score < search.at_least:
@@ -246,22 +251,22 @@ def search_gait(
 def measure(
     task: Locomotion, gait: Gait, noise: float, seeds: Sequence[int] = TEST
 ) -> dict[str, float]:
-    """Mean, spread and least return and the number of falls over the seeds."""
+    """Mean, standard deviation and minimum of the return and the number of falls over the seeds."""
     env = task.make_env().unwrapped
-    outs = [task.walk(env, gait, seed, noise) for seed in seeds]
-    rewards = np.array([out.reward for out in outs])
+    outcomes = [task.walk(env, gait, seed, noise) for seed in seeds]
+    rewards = np.array([outcome.reward for outcome in outcomes])
     return {
         "noise": noise,
-        "n": len(outs),
+        "n": len(outcomes),
         "mean": round(float(rewards.mean()), 1),
         "sd": round(float(rewards.std(ddof=1)), 1),
         "min": round(float(rewards.min()), 1),
-        "falls": sum(out.fell for out in outs),
+        "falls": sum(outcome.fell for outcome in outcomes),
     }
 
 
 def entry(task: Locomotion, search: Search, seed: int, gait: Gait, steps: int) -> dict[str, Any]:
-    """What is written down of a gait."""
+    """The entry of a gait in the file."""
     returns = [measure(task, gait, noise) for noise in search.test]
     return {
         "seed": seed,
@@ -273,48 +278,51 @@ def entry(task: Locomotion, search: Search, seed: int, gait: Gait, steps: int) -
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Search the gaits of a task and write them to a file."""
     parser = argparse.ArgumentParser(description="Search linear gaits by Augmented Random Search.")
     parser.add_argument("task", choices=list(SEARCHES))
-    parser.add_argument("--steps", type=int, help="environment steps a seed (default: the task's)")
     parser.add_argument(
-        "--seed", type=int, nargs="+", default=[0], help="one or several seeds, a gait each"
+        "--steps", type=int, help="environment steps per seed (default: the task's)"
+    )
+    parser.add_argument(
+        "--seed", type=int, nargs="+", default=[0], help="one or more seeds, one gait per seed"
     )
     parser.add_argument(
         "--out", type=Path, help="JSON file to write (default: models/<task>/expert.json)"
     )
-    asked = parser.parse_args(arguments)
-    task, search = load_task(asked.task), SEARCHES[asked.task]
+    options = parser.parse_args(arguments)
+    task, search = load_task(options.task), SEARCHES[options.task]
     if not isinstance(task, Locomotion):
         raise CdiffError(f"{task.name} has no gaits to search for")
-    if asked.steps:
-        search = search.within(asked.steps)
-    out = asked.out or home() / "models" / task.name / "expert.json"
+    if options.steps:
+        search = search.within(options.steps)
+    out = options.out or home() / "models" / task.name / "expert.json"
     policies = []
-    for seed in asked.seed:
-        found = search_gait(task, search, seed, partial(_tell_seed, seed))
-        if found is None:
-            _tell(f"seed {seed}: given up, under {search.at_least:g}")
+    for seed in options.seed:
+        result = search_gait(task, search, seed, partial(_print_seed, seed))
+        if result is None:
+            _print(f"seed {seed}: given up, under {search.at_least:g}")
             continue
-        policies.append(entry(task, search, seed, *found))
-        _tell(f"seed {seed}: {policies[-1]['returns']}")
+        policies.append(entry(task, search, seed, *result))
+        _print(f"seed {seed}: {policies[-1]['returns']}")
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(dump(task.name, policies))
-    _tell(
+    _print(
         f"{len(policies)} gaits in {shown(out)}" if policies else "no gait found; nothing written"
     )
 
 
 def dump(name: str, policies: Sequence[dict[str, Any]]) -> str:
-    """JSON with one line a row of W."""
+    """The file of the gaits as JSON."""
     text = json.dumps({"task": name, "policies": policies}, indent=1)
     return text + "\n"
 
 
-def _tell_seed(seed: int, text: str) -> None:
-    _tell(f"seed {seed}: {text}")
+def _print_seed(seed: int, text: str) -> None:
+    _print(f"seed {seed}: {text}")
 
 
-def _tell(text: str) -> None:
+def _print(text: str) -> None:
     sys.stderr.write(text + "\n")
     sys.stderr.flush()
 

@@ -1,4 +1,6 @@
-"""`kind: dynamics` and `safety:` in a constraint file: what they compile to, mistakes, records, `cdiff check`, `cdiff verify`."""
+"""`kind: dynamics` and `safety:` in a constraint file: what they compile to, mistakes, records,
+`cdiff check`, `cdiff verify`.
+"""
 
 import dataclasses
 
@@ -53,21 +55,25 @@ def load(folder, *entries, dynamics=None):
     return load_constraints(path, "maze2d-umaze", LAYOUT, dynamics)
 
 
-# what they compile to -------------------------------------------------------------------------------------------------
+# what they compile to -----------------------------------------------------------------------------
 
 
 def test_given_dynamics_by_hand(tmp_path):
-    """From (0, 0, 2, 4) with inputs (1, 0.5): x = 1, y = 2, vx = 3, vy = 4 + 1 - .25; up = -1 is beyond its bound 0, by 2 in vy."""
+    """From (0, 0, 2, 4) with inputs (1, 0.5): x = 1, y = 2, vx = 3, vy = 4 + 1 - .25; up = -1 is
+    beyond its bound 0, by 2 in vy.
+    """
     (kind,), g = load(tmp_path, GIVEN)
     x = torch.tensor([[[0, 0, 2, 4], [1, 2, 3, 4.75], [2.5, 4.375, 3, 2.5]]], dtype=torch.float64)
     torch.testing.assert_close(
         g(x), torch.tensor([[0, 2.0]], dtype=torch.float64) - 1e-5, atol=1e-12, rtol=0
     )
     assert g.labels(3) == ["ball@0-1", "ball@1-2"]
-    assert kind.describe() == "each step obeys x' = A x + B u + c, -1 <= right <= 1, 0 <= up <= 2"
+    assert (
+        kind.describe() == "each step satisfies x' = A x + B u + c, -1 <= right <= 1, 0 <= up <= 2"
+    )
 
 
-def test_the_tolerance_is_the_users(tmp_path):
+def test_tolerance_of_dynamics_is_read_from_the_file(tmp_path):
     _, g = load(tmp_path, GIVEN | {"tolerance": 0.5})
     x = torch.tensor([[[0, 0, 2, 4], [1, 2, 3.5, 4.75]]], dtype=torch.float64)
     torch.testing.assert_close(g(x), torch.tensor([[0.0]], dtype=torch.float64), atol=1e-12, rtol=0)
@@ -89,7 +95,7 @@ def test_fit_demonstrations_stands_for_the_checkpoints_dynamics_in_full(tmp_path
         assert torch.equal(getattr(again.dynamics, name), value), name
 
 
-# mistakes -------------------------------------------------------------------------------------------------------------
+# mistakes -----------------------------------------------------------------------------------------
 
 A = "A: {x: {x: 1.0}, y: {y: 1.0}, vx: {vx: 1.0}, vy: {vy: 1.0}}"
 B = "B: {vx: {right: 1.0}}"
@@ -193,7 +199,7 @@ def test_the_schema_knows_dynamics_and_safety():
     )
 
 
-# safety ---------------------------------------------------------------------------------------------------------------
+# safety -------------------------------------------------------------------------------------------
 
 DISC = f"{{{BALL}, side: outside}}"
 SAFETY = {
@@ -213,7 +219,7 @@ SAFETY = {
 @pytest.mark.parametrize("preset", ["waypoints", "segments"])
 @pytest.mark.parametrize("own", [None, "waypoints", "segments"])
 @pytest.mark.parametrize("case", SAFETY)
-def test_a_constraints_own_safety_goes_before_the_presets(case, own, preset, tmp_path):
+def test_safety_in_the_file_overrides_the_preset(case, own, preset, tmp_path):
     entry, on_segments = SAFETY[case]
     kinds, g = load(tmp_path, yaml.safe_load(entry) | ({"safety": own} if own else {}))
     wanted = on_segments if (own or preset) == "segments" else [type(part) for part in g.parts]
@@ -226,7 +232,7 @@ def test_dynamics_are_the_same_whatever_the_safety(preset, tmp_path):
     assert enforced(kinds, g, preset) == g
 
 
-def test_a_squared_ball_is_obeyed_on_segments_as_the_ball_it_is(tmp_path):
+def test_squared_ball_is_kept_on_segments_as_a_ball(tmp_path):
     kinds, g = load(tmp_path, yaml.safe_load(DISC) | {"form": "squared"})
     (part,) = enforced(kinds, g, "segments").parts
     (ball,) = enforced(*load(tmp_path, yaml.safe_load(DISC)), "segments").parts
@@ -240,7 +246,7 @@ def test_a_squared_ball_is_obeyed_on_segments_as_the_ball_it_is(tmp_path):
     assert torch.equal(part.level(x) > 0, g(x) > 0)
 
 
-# records and commands -------------------------------------------------------------------------------------------------
+# records and commands -----------------------------------------------------------------------------
 
 STEPS = [
     (0.0, 0.0, 2.0, 4.0),
@@ -250,7 +256,7 @@ STEPS = [
 TORN = [STEPS[0], (1.0, 2.0, 3.0, 5.75), (9.0, 9.0, 9.0, 9.0)]
 
 
-def test_a_run_under_dynamics_is_certified_and_one_that_tears_them_is_not(tmp_path):
+def test_run_that_satisfies_dynamics_is_certified_and_a_torn_one_is_not(tmp_path):
     result = verify(make_run(tmp_path / "whole", STEPS, kinds=(GIVEN,)), code=0)
     assert "1 of 1 plans safe at the waypoints, 1 of 1 between them" in result.stdout
     result = verify(make_run(tmp_path / "torn", STEPS, TORN, kinds=(GIVEN,)), code=1)
@@ -281,7 +287,7 @@ def test_a_run_of_fitted_dynamics_is_verified_without_its_checkpoint(tmp_path):
     assert "entries[0].segments.exact says false, recomputed true" in verify(run, code=1).stdout
 
 
-def test_dynamics_have_nothing_to_obey_between_waypoints(tmp_path):
+def test_dynamics_restrict_no_point_between_waypoints(tmp_path):
     _, g = load(tmp_path, GIVEN)
     task = dataclasses.replace(load_task("maze2d-umaze"))
     proof = certificate(
@@ -316,7 +322,7 @@ def test_check_shows_dynamics(entry, tmp_path, monkeypatch):
     out = Console(record=True, width=240)
     cdiff_cli.commands.check.check(tmp_path / "own.yaml", tmp_path / "own.png", out)
     text = out.export_text()
-    assert "each step obeys x' = A x + B u + c" in text
+    assert "each step satisfies x' = A x + B u + c" in text
     assert "active set" in text
     assert "127" in text  # a row a step
     assert (tmp_path / "own.png").exists()

@@ -42,7 +42,7 @@ def rows(folder: Path, entry: str, *states: tuple[float, float, float, float]) -
     return g(torch.tensor([states], dtype=torch.float64))[0].tolist()
 
 
-# known answers --------------------------------------------------------------------------------------------------------
+# known answers ------------------------------------------------------------------------------------
 
 ELLIPSE = "kind: quadratic, centre: {y: 0.0, x: 0.0}, semi_axes: {x: 2.0, y: 1.0}"
 BALL = "kind: quadratic, centre: {x: 1.0, y: 0.0}, radius: 2.0"
@@ -139,7 +139,7 @@ def test_shipped_constraint_files_exist():
     assert len(SHIPPED) >= 5
 
 
-# properties -----------------------------------------------------------------------------------------------------------
+# properties ---------------------------------------------------------------------------------------
 
 reals = st.floats(-10, 10)
 
@@ -183,7 +183,7 @@ def test_dcbf_with_alpha_1_only_asks_for_h_at_the_next_waypoint(velocities):
     assert torch.equal(chain.compile(LAYOUT)(x), barrier.compile(LAYOUT)(x)[:, 1:])
 
 
-# mistakes -------------------------------------------------------------------------------------------------------------
+# mistakes -----------------------------------------------------------------------------------------
 
 
 def item(*lines: str) -> str:
@@ -342,7 +342,7 @@ def test_an_empty_constraint_file_is_called_empty(tmp_path):
         load_constraints(write(tmp_path, ""), "maze2d-umaze", LAYOUT)
 
 
-# schema and plug-ins --------------------------------------------------------------------------------------------------
+# schema and plug-ins ------------------------------------------------------------------------------
 
 
 class Floor(Strict):

@@ -1,4 +1,6 @@
-"""The interior-point method: its cones, its linear-quadratic steps, its results against ProxQP and ADMM."""
+"""The interior-point method: its cones, its linear-quadratic steps, its results against ProxQP and
+ADMM.
+"""
 
 import numpy as np
 import pytest
@@ -37,7 +39,7 @@ def inside(seed, k, depth):
     return s
 
 
-# cones ----------------------------------------------------------------------------------------------------------------
+# cones --------------------------------------------------------------------------------------------
 
 SIZES = (0, 1, 2, 3)
 
@@ -82,11 +84,11 @@ def test_the_way_out_ends_on_the_boundary(k, seed):
     assert bool((before[:, 0] > before[:, 1:].norm(dim=1)).all())
 
 
-# steps ----------------------------------------------------------------------------------------------------------------
+# steps --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("horizon", [2, riccati.BLOCK, riccati.BLOCK + 1, 3 * riccati.BLOCK - 2])
-def test_the_recursion_solves_the_whole_system(horizon):
+def test_riccati_recursion_solves_the_dense_system(horizon):
     n, m, batch = 4, 2, 2
     root, g = normal(0, batch, horizon, 6, 6), normal(1, batch, horizon, 6)
     H = root @ root.mT + 0.1 * torch.eye(6, dtype=F64)
@@ -101,7 +103,7 @@ def test_the_recursion_solves_the_whole_system(horizon):
         torch.testing.assert_close(q[b].flatten(), known, atol=1e-8, rtol=1e-8)
 
 
-# results --------------------------------------------------------------------------------------------------------------
+# results ------------------------------------------------------------------------------------------
 
 WEIGHT = torch.tensor([1.0, 1.0, 0.02, 0.02], dtype=F64)
 
@@ -144,7 +146,7 @@ def by_proxqp(z, rates, wall, goal):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("goal", [True, False])
-def test_rates_of_single_coordinates_beside_dynamics_end_where_proxqp_does(seed, goal):
+def test_rates_of_single_coordinates_with_dynamics_agree_with_proxqp(seed, goal):
     u = normal(seed, 1, 14, 2).clamp(-1, 1)
     still = torch.zeros(1, 4, dtype=F64)
     z = PUSHED.rollout(still, 2 * u) + 0.05 * normal(seed + 9, 1, 15, 4)
@@ -161,7 +163,15 @@ def test_rates_of_single_coordinates_beside_dynamics_end_where_proxqp_does(seed,
     )
     pins = pin(z, 0, -1) if goal else pin(z, 0)
     x, made = project_rate_dynamics(
-        PUSHED, [wall], rates, z, pins, used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+        PUSHED,
+        [wall],
+        rates,
+        z,
+        pins,
+        columns=range(4),
+        weight=WEIGHT,
+        max_choices=1,
+        tolerance=1e-9,
     )
     torch.testing.assert_close(PUSHED.rollout(still, made), x, atol=1e-9, rtol=0)
     assert any(float(one(x).max()) > -1e-6 for one in rates)
@@ -172,7 +182,7 @@ def test_rates_of_single_coordinates_beside_dynamics_end_where_proxqp_does(seed,
 
 @quick
 @given(seed=seeds, horizon=st.sampled_from([2, 5, 40]), held=st.sampled_from([(0,), (0, -1)]))
-def test_without_dynamics_it_ends_where_admm_does(seed, horizon, held):
+def test_interior_points_without_dynamics_agree_with_admm(seed, horizon, held):
     limits = [
         rate(2, (0, 1), high=0.5, norm=True, dt=DT),
         rate(2, (1,), low=-0.3, high=0.4, dt=DT, name="y"),
@@ -185,7 +195,7 @@ def test_without_dynamics_it_ends_where_admm_does(seed, horizon, held):
     )  # as SMALL**0.5
 
 
-def test_a_limit_that_leaves_hardly_any_time_is_met():
+def test_limit_that_leaves_hardly_any_time_is_satisfied():
     """Where ADMM has not converged after its rounds."""
     s = torch.linspace(0, 1, 128, dtype=F64)
     z = torch.stack((s**3, (3 * s).sin() * (1 - s)), -1)[None]
@@ -195,7 +205,7 @@ def test_a_limit_that_leaves_hardly_any_time_is_met():
     assert torch.equal(x[:, [0, -1]], z[:, [0, -1]])
 
 
-def test_a_plan_does_not_depend_on_the_others_of_its_batch():
+def test_result_of_a_plan_does_not_depend_on_its_batch():
     z = 0.3 * normal(0, 3, 30, 4).cumsum(1)
     z[2] *= 1e-3  # nothing to do, and done early
     limits = [
@@ -205,7 +215,15 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
 
     def paced(z):
         return project_rate_dynamics(
-            PUSHED, [], limits, z, pin(z, 0), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+            PUSHED,
+            [],
+            limits,
+            z,
+            pin(z, 0),
+            columns=range(4),
+            weight=WEIGHT,
+            max_choices=1,
+            tolerance=1e-9,
         )[0]
 
     together = paced(z)
@@ -215,22 +233,38 @@ def test_a_plan_does_not_depend_on_the_others_of_its_batch():
         )  # of a flat cost
 
 
-def test_where_the_goal_is_too_far_the_limits_hold_and_the_goal_is_missed():
+def test_limits_hold_and_an_unreachable_goal_is_missed():
     """In 2.9 s at 0.2 a second it gets 0.58 far, less what it takes to start and stop."""
     z = torch.zeros(1, 30, 4, dtype=F64)
     z[:, :, 0] = torch.linspace(0, 1, 30, dtype=F64)
     limits = [rate(4, (0, 1), high=0.2, norm=True, dt=DT)]
     x, u = project_rate_dynamics(
-        PUSHED, [], limits, z, pin(z, 0, -1), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+        PUSHED,
+        [],
+        limits,
+        z,
+        pin(z, 0, -1),
+        columns=range(4),
+        weight=WEIGHT,
+        max_choices=1,
+        tolerance=1e-9,
     )
     assert float(limits[0](x).max()) <= 1e-4  # of the limits, as far as they give way
     assert float(u.abs().max()) <= 1 + 1e-4
     assert 0.5 < float(x[0, -1, 0]) < 0.58
 
 
-def test_nothing_to_plan_comes_back():
+def test_empty_batch_of_interior_points_is_returned():
     for z in (torch.zeros(0, 5, 4, dtype=F64), torch.zeros(2, 1, 4, dtype=F64)):
         x, u = project_rate_dynamics(
-            PUSHED, [], [], z, Pins.none(z), used=range(4), weight=WEIGHT, turns=1, tolerance=1e-9
+            PUSHED,
+            [],
+            [],
+            z,
+            Pins.none(z),
+            columns=range(4),
+            weight=WEIGHT,
+            max_choices=1,
+            tolerance=1e-9,
         )
         assert (x.shape, u.shape) == (z.shape, (len(z), z.shape[1] - 1, 2))

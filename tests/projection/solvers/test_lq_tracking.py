@@ -69,7 +69,7 @@ def test_the_solution_is_that_of_the_dense_system(steps, ends):
 
 @settings(max_examples=10, deadline=None)
 @given(seed=seeds, steps=st.integers(3, 2 * PIECE + 5), ends=st.booleans())
-def test_every_response_obeys_the_dynamics_and_leaves_a_pinned_end(seed, steps, ends):
+def test_every_response_satisfies_the_dynamics_and_keeps_a_pinned_end(seed, steps, ends):
     A, B, c = system(seed)
     f = normal(seed + 3, 2, steps, 5)
     w = tracking(numbers(A, B, c), WEIGHT, steps, ends, f.device).respond(f)
@@ -80,7 +80,7 @@ def test_every_response_obeys_the_dynamics_and_leaves_a_pinned_end(seed, steps, 
 
 
 @pytest.mark.parametrize("ends", [False, True])
-def test_entries_between_rows_are_those_of_the_matrix_and_it_is_symmetric(ends):
+def test_products_between_rows_equal_the_dense_matrix_and_are_symmetric(ends):
     A, B, c = system(7)
     steps = 2 * PIECE + 5
     track = tracking(numbers(A, B, c), WEIGHT, steps, ends, A.device)
@@ -101,8 +101,10 @@ def test_entries_between_rows_are_those_of_the_matrix_and_it_is_symmetric(ends):
     torch.testing.assert_close(alone, C @ K @ C.mT, atol=1e-10 * scale, rtol=0)
 
 
-def test_a_state_that_no_input_moves_is_left_where_it_goes():
-    """The third coordinate halves at each step; its pinned end elsewhere is missed, the other two are met."""
+def test_coordinate_that_no_input_moves_follows_the_dynamics():
+    """The third coordinate halves at each step; its pinned end elsewhere is missed, the other two
+    are met.
+    """
     A = torch.diag(torch.tensor([1.0, 1.0, 0.5], dtype=F64))
     B = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], dtype=F64)
     z = normal(0, 1, 5, 3)
@@ -115,7 +117,7 @@ def test_a_state_that_no_input_moves_is_left_where_it_goes():
     )
 
 
-def test_of_two_inputs_with_one_effect_both_do_half():
+def test_two_inputs_with_the_same_effect_share_it_equally():
     A, B = torch.eye(1, dtype=F64), torch.ones(1, 2, dtype=F64)
     z = normal(0, 1, 4, 1)
     w = tracking(numbers(A, B, torch.zeros(1, dtype=F64)), (1.0,), 3, False, z.device).solve(

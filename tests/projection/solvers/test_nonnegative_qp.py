@@ -1,4 +1,6 @@
-"""Principal pivoting of a batch of small programs: known answers, the optimality conditions, and a solver's own."""
+"""Principal pivoting of a batch of small programs: known answers, the optimality conditions, and a
+solver's own.
+"""
 
 import pytest
 import torch
@@ -13,7 +15,9 @@ NONE = torch.zeros(1, 1, dtype=F64)
 
 
 def test_known_answers():
-    """Alone each row takes lam = d / M; of two rows that press on each other, the one that asks for more."""
+    """Alone each row takes lam = d / M; of two rows that press on each other, the one that asks for
+    more.
+    """
     assert nonnegative_least(torch.diag(vec(2.0, 4.0)), vec(1.0, -1.0)[None], NONE).tolist() == [
         [0.5, 0.0]
     ]
@@ -40,7 +44,7 @@ def test_random_problems_agree_with_lawson_and_hanson(n, seed, shared):
 
 
 @pytest.mark.parametrize("n", [1, 7])
-def test_a_plan_is_solved_as_it_is_alone(n):
+def test_program_of_a_batch_is_solved_as_alone(n):
     A, d = normal(0, 5, n, n + 2), normal(1, 5, n)
     M = A @ A.mT
     alone = torch.cat(
