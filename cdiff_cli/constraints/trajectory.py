@@ -287,6 +287,8 @@ def movable_rows(part: TrajectoryConstraint, pins: Pins) -> Bool[Tensor, "n"]:  
     All rows count as movable where the support of the part is not known.
     """
     free = (~pins.mask).any(1)
+    if part.support == 1:
+        return free
     if not part.support:
         return free.new_ones(len(part.labels(len(free))))
     if len(free) < part.support:

@@ -189,7 +189,7 @@ def _by_active_set(
         x = batch.solve(half_spaces, plans)
         return x, (batch.infeasible & infeasible)[plans]
 
-    unsafe = crossed(choice.parts, z)
+    unsafe = crossed(choice.parts, z).nonzero()[:, 0]
     around_obstacles(solve_plans, choice, z, unsafe, max_choices, batch.bounds.tolerance)
 
 
@@ -209,7 +209,7 @@ def _by_admm(
     """
     columns, every = list(batch.bounds.used), torch.arange(len(batch.x), device=batch.x.device)
     copy, push = warm.copy, warm.push
-    choice.choose(held.values, crossed(choice.parts, held.values))
+    choice.choose(held.values, crossed(choice.parts, held.values).nonzero()[:, 0])
     for k in range(1, rounds + 1):
         target = _between(batch.x, weight, copy - push, columns)
         batch.w0 = batch.track.solve(target, torch.zeros_like(batch.w))
@@ -220,7 +220,8 @@ def _by_admm(
         if tolerance and k % ADMM_CHECKED == 0 and float((x - copy).abs().max()) < tolerance:
             break
         unsafe = choice.newly_unsafe(x, batch.bounds.tolerance)
-        choice.choose(x, unsafe | choice.chosen if k in ADMM_CHOICES else unsafe)
+        plans = unsafe | choice.chosen if k in ADMM_CHOICES else unsafe
+        choice.choose(x, plans.nonzero()[:, 0])
     return copy, push
 
 

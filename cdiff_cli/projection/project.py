@@ -75,7 +75,7 @@ def project(g: Constraint, z: Traj, pins: Pins, *, strict: bool = True) -> Traj:
              sampling: return the best point that tangent half-spaces gave. With dynamics the result
              is never refused.
     """
-    problem = Problem(g, pins.paint(z), pins, strict)
+    problem = Problem.from_constraint(g, z, pins, strict)
     start, x = problem.z, problem.z
     if strict and not problem.dynamics:
         infeasible.check_pins(g, Pins(pins.mask, problem.z), max(problem.tolerance, 1e-6))

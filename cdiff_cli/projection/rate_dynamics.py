@@ -86,7 +86,7 @@ def project_rate_dynamics(
 
     first = (z if start is None else start)[..., used]
     choice = TangentChoice.none(parts, first, held)
-    unsafe = crossed(parts, first)
+    unsafe = crossed(parts, first).nonzero()[:, 0]
     around_obstacles(solve_plans, choice, first, unsafe, max_choices, tolerance)
     return x, u
 

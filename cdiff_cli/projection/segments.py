@@ -124,42 +124,48 @@ def crossed(parts: Sequence[Obstacle], x: Traj, tolerance: float = 0.0) -> Plans
 class TangentChoice:
     """The half-spaces chosen so far for each plan of a batch.
 
-    parts         act on the coordinates of x
-    pins          pinned coordinates of x
-    half_spaces   those of plans that were never chosen restrict nothing
-    chosen        plans that have half-spaces   [batch]
+    parts       act on the coordinates of x
+    x           targets, of which only the shape and dtype are used   [batch, horizon, k]
+    pins        pinned coordinates of x
+    chosen      plans that have half-spaces                           [batch]
+    complete    whether all plans have half-spaces
     """
 
     parts: Sequence[Obstacle]
+    x: Traj
     pins: Pins
-    half_spaces: HalfSpaces
     chosen: Plans
+    complete: bool = False
 
     @classmethod
     def none(cls, parts: Sequence[Obstacle], x: Traj, pins: Pins) -> "TangentChoice":
         """No plan has half-spaces."""
-        (batch, horizon, dim), m = x.shape, half_space_count(parts)
-        half_spaces = HalfSpaces(
-            x.new_zeros(batch, horizon, m, dim), x.new_full((batch, horizon, m), NEVER)
-        )
-        return cls(parts, pins, half_spaces, x.new_zeros(batch, dtype=torch.bool))
+        return cls(parts, x, pins, torch.zeros(len(x), dtype=torch.bool, device=x.device))
 
-    def choose(self, x: Traj, plans: Plans) -> None:
-        """Choose the half-spaces of these plans at x."""
-        if not bool(plans.any()):
+    @cached_property
+    def half_spaces(self) -> HalfSpaces:
+        """Those of all plans; plans that were never chosen have half-spaces that restrict nothing."""
+        (batch, horizon, dim), m = self.x.shape, half_space_count(self.parts)
+        a = self.x.new_zeros(batch, horizon, m, dim)
+        return HalfSpaces(a, self.x.new_full((batch, horizon, m), NEVER))
+
+    def choose(self, x: Traj, plans: Tensor) -> None:
+        """Choose the half-spaces of the plans with these indices at x."""
+        if not len(plans):
             return
-        if bool(plans.all()):
-            self.half_spaces, self.chosen = tangent_half_spaces(self.parts, x, self.pins), plans
+        if len(plans) == len(x):
+            self.half_spaces = tangent_half_spaces(self.parts, x, self.pins)
+            self.chosen, self.complete = torch.ones_like(self.chosen), True
             return
-        which = plans.nonzero()[:, 0]
-        pins = Pins(self.pins.mask, self.pins.values[which])
-        a, b = tangent_half_spaces([part.select(which) for part in self.parts], x[which], pins)
-        self.half_spaces.a[which], self.half_spaces.b[which] = a, b
-        self.chosen = self.chosen | plans
+        pins = Pins(self.pins.mask, self.pins.values[plans])
+        a, b = tangent_half_spaces([part.select(plans) for part in self.parts], x[plans], pins)
+        self.half_spaces.a[plans], self.half_spaces.b[plans] = a, b
+        self.chosen = self.chosen.index_fill(0, plans, True)
+        self.complete = bool(self.chosen.all())
 
     def newly_unsafe(self, x: Traj, tolerance: float) -> Plans:
         """Plans without half-spaces that violate a part by more than the tolerance."""
-        if bool(self.chosen.all()):
+        if self.complete:
             return ~self.chosen
         return crossed(self.parts, x, tolerance) & ~self.chosen
 
@@ -168,7 +174,7 @@ def around_obstacles(
     solve: Callable[[HalfSpaces, Tensor], tuple[Traj, Plans]],
     choice: TangentChoice,
     x: Traj,
-    unsafe: Plans,
+    unsafe: Tensor,
     max_choices: int,
     tolerance: float = 0.0,
 ) -> Traj:
@@ -181,24 +187,27 @@ def around_obstacles(
     solve         (half-spaces of all plans, indices of the plans to solve) -> their trajectories,
                   and whether to keep their half-spaces from then on
     x             trajectories in the coordinates of the parts
-    unsafe        plans that get half-spaces before the first solution
+    unsafe        indices of the plans that get half-spaces before the first solution
     max_choices   how often the half-spaces of a plan are chosen
     tolerance     violation of a part that is accepted
     """
-    plans, kept = torch.arange(len(x), device=x.device), torch.zeros_like(unsafe)
-    for k in range(max_choices + 1):
-        choice.choose(x, unsafe)
+    choice.choose(x, unsafe)
+    x, kept = solve(choice.half_spaces, torch.arange(len(x), device=x.device))
+    for k in range(1, max_choices + 1):
+        if choice.complete and k == max_choices:
+            break
+        again = choice.newly_unsafe(x, tolerance)
+        if k < max_choices:
+            again = again | choice.chosen & ~kept
+        plans = again.nonzero()[:, 0]
+        if not len(plans):
+            break
+        choice.choose(x, plans)
         solution, keep = solve(choice.half_spaces, plans)
         if len(plans) == len(x):
             x, kept = solution, keep
         else:
             x, kept = x.index_copy(0, plans, solution), kept.index_copy(0, plans, keep)
-        unsafe = choice.newly_unsafe(x, tolerance)
-        if k + 1 < max_choices:
-            unsafe = unsafe | choice.chosen & ~kept
-        plans = unsafe.nonzero()[:, 0]
-        if not len(plans):
-            break
     return x
 
 
@@ -208,19 +217,25 @@ def project_segments(parts: Sequence[Obstacle], z: Traj, pins: Pins, max_choices
     A later choice of half-spaces never increases the distance to z, because its set contains the
     last solution.
     """
-    unsafe = crossed(parts, z)
-    plans = unsafe.nonzero()[:, 0]
+    plans = crossed(parts, z).nonzero()[:, 0]
     if not len(plans):
         return z
     if len(plans) < len(z):
-        near = project_segments([part.select(plans) for part in parts], z[plans], pins, max_choices)
+        near = _around([part.select(plans) for part in parts], z[plans], pins, max_choices)
         return z.index_copy(0, plans, near)
+    return _around(parts, z, pins, max_choices)
+
+
+def _around(parts: Sequence[Obstacle], z: Traj, pins: Pins, max_choices: int) -> Traj:
+    """The nearest trajectory in tangent half-spaces of the parts, which every plan gets."""
+    choice = TangentChoice.none(parts, z, pins)
+    again = choice.chosen  # no plan keeps its half-spaces
 
     def solve(half_spaces: HalfSpaces, _: Tensor) -> tuple[Traj, Plans]:
-        return nearest_in_half_spaces(z, half_spaces, pins.held), ~unsafe  # all are unsafe
+        return nearest_in_half_spaces(z, half_spaces, pins.held), again
 
-    choice = TangentChoice.none(parts, z, pins)
-    return around_obstacles(solve, choice, z, unsafe, max_choices)
+    every = torch.arange(len(z), device=z.device)
+    return around_obstacles(solve, choice, z, every, max_choices)
 
 
 # tangent planes as rows ---------------------------------------------------------------------------

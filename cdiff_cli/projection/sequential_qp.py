@@ -81,5 +81,6 @@ def free_rows(g: Constraint, x: Traj, pins: Pins) -> Rows:
     Those rows are checked once, before anything moves (infeasible.py).
     """
     rows = g(x)
-    movable = torch.cat([movable_rows(part, pins) for part in g.parts])
-    return torch.where(movable, rows, rows.clamp_max(0.0))
+    movable = [movable_rows(part, pins) for part in g.parts]
+    free = movable[0] if len(movable) == 1 else torch.cat(movable)
+    return torch.where(free, rows, rows.clamp_max(0.0))

@@ -30,75 +30,71 @@ from cdiff_cli.projection.segments import (
 from cdiff_cli.projection.sequential_qp import free_rows, holds, sequential_qp
 
 
-@dataclass(frozen=True)
+@dataclass
 class Problem:
     """A projection to be solved, and what strategies ask about it.
 
-    z        the trajectories, with pinned coordinates at their values
-    strict   whether a result must satisfy g; otherwise the best point around obstacles is enough
+    z             the trajectories, with pinned coordinates at their values
+    strict        whether a result must satisfy g; if not, the best point around obstacles is enough
+    tolerance     violation of g that rounding alone may cause, environment units
+    dynamics      parts that are dynamics
+    obstacles     parts that half-spaces describe, where one of them is on segments
+    others        the parts that are not obstacles
+    rates         parts that limit rates
+    step_limits   the other parts, where all are limits on steps and one is a rate; else none
     """
 
     g: Constraint
     z: Traj
     pins: Pins
     strict: bool
+    tolerance: float
+    dynamics: Sequence[LinearDynamicsConstraint]
+    obstacles: Sequence[Obstacle]
+    others: Sequence[TrajectoryConstraint]
+    rates: Sequence[RateLimit]
+    step_limits: Sequence[StepLimit]
 
-    @cached_property
-    def tolerance(self) -> float:
-        """Violation of g that rounding alone may cause, environment units."""
-        return 1e-9 if self.z.dtype == torch.float64 else 2e-6
+    @classmethod
+    def from_constraint(cls, g: Constraint, z: Traj, pins: Pins, strict: bool) -> "Problem":
+        """The problem of projecting z onto g and the pins."""
+        obstacles: Sequence[Obstacle] = []
+        others: Sequence[TrajectoryConstraint] = g.parts
+        if any(isinstance(part, OnSegments) for part in g.parts):
+            obstacles = [part for part in g.parts if has_half_spaces(part)]
+        if obstacles:
+            others = [part for part in g.parts if not has_half_spaces(part)]
+        rates = limits_of(g)
+        limits = [part for part in others if limits_steps(part)] if rates else []
+        if len(limits) < len(others) or not only_ends(pins):
+            limits = []
+        tolerance = 1e-9 if z.dtype == torch.float64 else 2e-6
+        z = pins.paint(z)
+        return cls(g, z, pins, strict, tolerance, dynamics_of(g), obstacles, others, rates, limits)
 
     @property
     def empty(self) -> bool:
+        """Whether there is nothing to project."""
         return not self.g.parts or self.z.numel() == 0
-
-    @cached_property
-    def dynamics(self) -> list[LinearDynamicsConstraint]:
-        return dynamics_of(self.g)
-
-    @cached_property
-    def obstacles(self) -> list[Obstacle]:
-        """Parts that half-spaces describe, where one of them is on segments."""
-        if not any(isinstance(part, OnSegments) for part in self.g.parts):
-            return []
-        return [part for part in self.g.parts if has_half_spaces(part)]
-
-    @cached_property
-    def others(self) -> Sequence[TrajectoryConstraint]:
-        """The parts that are not obstacles."""
-        if not self.obstacles:
-            return self.g.parts
-        return [part for part in self.g.parts if not has_half_spaces(part)]
 
     @property
     def max_choices(self) -> int:
         """How often tangent half-spaces are chosen."""
         return MAX_CHOICES if self.strict else 1
 
-    @cached_property
+    @property
     def several(self) -> bool:
         """Whether several parts without obstacles or dynamics must hold together."""
-        return len(self.others) > 1 and self.pins.whole and not self.obstacles and not self.dynamics
-
-    @cached_property
-    def rates(self) -> list[RateLimit]:
-        return limits_of(self.g)
-
-    @cached_property
-    def step_limits(self) -> list[StepLimit]:
-        """The other parts, where all are limits on steps and one is a rate; else none."""
-        limits = [part for part in self.others if limits_steps(part)]
-        together = bool(self.rates) and len(limits) == len(self.others) and only_ends(self.pins)
-        return limits if together else []
+        plain = len(self.others) > 1 and not self.obstacles and not self.dynamics
+        return plain and self.pins.whole
 
     @property
     def coupled(self) -> bool:
         """Whether rates must hold together with obstacles or barriers."""
-        return bool(self.step_limits) and (
-            bool(self.obstacles) or len(self.rates) < len(self.others)
-        )
+        together = bool(self.obstacles) or len(self.rates) < len(self.others)
+        return bool(self.step_limits) and together
 
-    @cached_property
+    @property
     def exact(self) -> bool:
         """Whether every part besides obstacles has a projector of its own."""
         return (self.pins.whole or not self.others) and all(
