@@ -260,7 +260,7 @@ def sweep(
     address: o.Address = None,
     runs: o.RunsFolder = RUNS,
 ) -> None:
-    """Make the missing runs of a matrix of tasks, methods, presets and seeds.
+    """Make the missing runs of a matrix of tasks, methods and seeds.
 
     Interrupted, it continues when started again. Exit code 1: a run failed or diverged.
     `cdiff compare` prints the table.
@@ -316,7 +316,10 @@ def check(
     schema: o.Schema = False,
     picture: o.Picture = None,
 ) -> None:
-    """Validate a constraint file, say what it means, and draw it over the demonstrations."""
+    """Validate and explain a constraint file.
+
+    It prints what each constraint means and draws them over the demonstrations.
+    """
     from cdiff_cli.constraints.spec import load
 
     if schema:
@@ -338,7 +341,7 @@ def list_(
     kind: o.ListKind,
     as_json: o.AsJson = False,
 ) -> None:
-    """List tasks, constraints, methods, presets, kernels, models or columns."""
+    """List tasks, constraints, methods, presets, models and other names."""
     from cdiff_cli.commands.list_names import print_names
 
     print_names(kind, as_json, out)

@@ -147,7 +147,7 @@ def test_equal_seeds_give_equal_rows_but_for_times(ball_run, tmp_path):
 
 
 def test_compare_prints_closed_loop_runs(ball_run):
-    stdout = cdiff("compare", ball_run[0].parent, "--format", "markdown").stdout
+    stdout = cdiff("compare", ball_run[0].parent, "--wide", "--format", "markdown").stdout
     for title in ("return", "violation rate / %", "contacts", "latency / ms"):
         assert title in stdout
     assert "| ball-run | ball-run | alm | recommended | 2 |" in stdout
