@@ -183,3 +183,171 @@ def test_no_unsafe_yaml_eval_or_global_seed():
             if isinstance(node, ast.Call)
         }
         assert called & forbidden == set(), name
+
+
+# functions ---------------------------------------------------------------------------------------
+
+MOST_LOCALS, MOST_BRANCHES = 20, 15
+TOO_LARGE = {
+    "commands.check.check",
+    "commands.compare.print_comparison",
+    "constraints.spec.sets.Quadratic._one_shape",
+    "planning.receding_horizon.rollout",
+    "projection.solvers.active_set._active_rows",
+}
+"""Functions above a limit, each to be split; none may be added."""
+
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+BRANCHES = (ast.If, ast.For, ast.While, ast.ExceptHandler, ast.IfExp)
+
+
+def functions(name: str, node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """(dotted name, definition) of every function below a node, nested ones too."""
+    for child in ast.iter_child_nodes(node):
+        inner = f"{name}.{child.name}" if isinstance(child, (*FUNCTIONS, ast.ClassDef)) else name
+        if isinstance(child, FUNCTIONS):
+            yield inner, child
+        yield from functions(inner, child)
+
+
+def body(function: ast.AST) -> Iterator[ast.AST]:
+    """All nodes of a function, without those of functions inside it."""
+    for child in ast.iter_child_nodes(function):
+        if not isinstance(child, (*FUNCTIONS, ast.Lambda)):
+            yield child
+            yield from body(child)
+
+
+def local_names(function: ast.AST) -> int:
+    """Names that a function assigns, those of its comprehensions included, without parameters."""
+    nodes = list(body(function))
+    names = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    return len(names | {n.name for n in nodes if isinstance(n, ast.ExceptHandler) and n.name})
+
+
+def branches(function: ast.AST) -> int:
+    """Places where a function decides."""
+    count = 0
+    for node in body(function):
+        if isinstance(node, BRANCHES):
+            count += 1
+        elif isinstance(node, ast.BoolOp):
+            count += len(node.values) - 1
+        elif isinstance(node, ast.comprehension):
+            count += len(node.ifs)
+    return count
+
+
+def test_branches_and_local_names_are_counted():
+    source = """
+def f(x, y):
+    a = [b for b in x if b and y or not b]
+    for c in a if x else y:
+        try:
+            d, e = c
+        except ValueError as g:
+            return lambda h: h if h else (k := 3)
+    def inner():
+        z = 1 if x else 2
+"""
+    ((_, outer), _) = functions("", ast.parse(source))
+    assert local_names(outer) == 6  # a, b, c, d, e, g
+    assert branches(outer) == 6  # comprehension if, and, or, for, ternary, except
+
+
+def test_functions_are_small():
+    large = {
+        name
+        for module_name, path in MODULES.items()
+        for name, function in functions(module_name, ast.parse(path.read_text()))
+        if local_names(function) > MOST_LOCALS or branches(function) > MOST_BRANCHES
+    }
+    assert large - TOO_LARGE == set(), "split them"
+    assert TOO_LARGE - large == set(), "they are small now: take them off the list"
+
+
+# the host process --------------------------------------------------------------------------------
+
+HOST = """
+import importlib, logging, os, random, warnings
+import matplotlib, numpy, torch
+
+for name in {third_party!r}:
+    importlib.import_module(name)
+
+def host():
+    return {{
+        "matplotlib": dict.copy(matplotlib.rcParams),
+        "warnings": list(warnings.filters),
+        "threads": (torch.get_num_threads(), torch.get_num_interop_threads()),
+        "torch": (torch.get_default_dtype(), torch.is_grad_enabled()),
+        "numpy": (numpy.geterr(), numpy.get_printoptions()),
+        "random": (random.getstate(), str(numpy.random.get_state()), torch.get_rng_state().tolist()),
+        "logging": (logging.root.level, list(logging.root.handlers)),
+        "environment": dict(os.environ),
+        "folder": os.getcwd(),
+    }}
+
+before = host()
+for name in {modules!r}:
+    importlib.import_module(name)
+import cdiff_cli
+for name in cdiff_cli.__all__:
+    getattr(cdiff_cli, name)
+after = host()
+assert "cdiff_cli.evaluation.figures.plans" in {modules!r}
+assert before.keys() == after.keys()
+changed = [name for name in before if str(before[name]) != str(after[name])]
+assert changed == [], changed
+"""
+
+
+def imported_on_import(path: Path) -> set[str]:
+    """Modules from outside that a file imports when it is imported itself."""
+    names: set[str] = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module or "")
+    return {name for name in names if name.split(".")[0] != "cdiff_cli"}
+
+
+def test_importing_the_package_changes_nothing_in_the_host():
+    modules = [
+        f"cdiff_cli.{name}".rstrip(".")
+        for name in MODULES
+        if name != "cli" and not name.startswith("tasks.")
+    ]
+    outer = {name for path in FILES for name in imported_on_import(path)}
+    third_party = sorted(name for name in outer if name.split(".")[0] not in SIMULATORS)
+    code = HOST.format(third_party=third_party, modules=modules)
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+
+
+# prose -------------------------------------------------------------------------------------------
+
+THING = (
+    "row|plan|step|call|waypoint|segment|episode|file|seed|batch|task|method|constraint|pass|gait"
+)
+BARE_RATES = (
+    rf"\b(a|an|one) (network )?({THING}) (a|an) ({THING}|second|minute)\b",
+    rf"\b({THING.replace('|', 's|')}s|passes|batches|seconds|ms) (a|an) ({THING}|minute)\b",
+    r"\b(steps|frames|calls|plans|metres|rows) a second\b",
+)
+"""Rates with a bare article, as in "a row a segment"; write "one row per segment"."""
+
+
+def test_rates_say_per():
+    def rates(text: str) -> list[str]:
+        flat = re.sub(r"\s+(#\s+)?", " ", text)
+        return [match[0] for rate in BARE_RATES for match in re.finditer(rate, flat)]
+
+    assert rates("a row a segment, two calls\n    # a plan") == ["a row a segment", "calls a plan"]
+    assert rates("one row per segment, calls per plan, a step. A plan") == []
+    assert {name: rates(path.read_text()) for name, path in MODULES.items()} == {
+        name: [] for name in MODULES
+    }

@@ -132,7 +132,7 @@ def test_a_closed_loop_run_holds_every_artifact(ball_run):
 
 def test_a_closed_loop_run_is_filmed(ball_run):
     frames = iio.imread(ball_run[0] / "rollout.gif")
-    assert len(frames) == 100  # one a step: 25 a second at 30 steps a second
+    assert len(frames) == 100  # one per step: 25 per second at 30 steps per second
     assert (frames[0] != frames[-1]).any()
 
 

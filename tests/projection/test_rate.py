@@ -392,7 +392,7 @@ def test_check_describes_a_rate(tmp_path):
         "check", "constraints/maze2d-umaze-rate.yaml", "--picture", tmp_path / "check.png"
     ).stdout
     assert "ADMM" in out
-    assert "127" in out  # a row a segment
+    assert "127" in out  # one row per segment
 
 
 def test_pinned_ends_too_far_apart_end_in_one_line(tmp_path):

@@ -1,6 +1,8 @@
-"""Steps a second of the ball-run environment, resets included, on one thread.
+"""How many steps per second does the ball-run environment make?
 
-python tests/benchmarks/speed/ball_run.py [--episodes 50]
+    python tests/benchmarks/speed/ball_run.py [--episodes 50]
+
+One thread; resets are included.
 """
 
 import argparse
@@ -18,7 +20,7 @@ parser.add_argument(
     "--episodes",
     type=int,
     default=50,
-    help="episodes a repeat; the median of three repeats is taken",
+    help="episodes per repeat; the result is the median of three repeats",
 )
 episodes = parser.parse_args().episodes
 push = np.array([0.4, 0.0], dtype=np.float32)

@@ -1,9 +1,11 @@
-"""The exact projection onto a barrier chain against ProxQP through qpsolvers, in one run on one thread.
+"""How much faster than ProxQP is the exact projection onto a barrier?
 
     python tests/benchmarks/speed/chain.py [--alpha 0.05] [--repeats 9] [--plans 3]
 
-Ours: median over the repeats, after a warm-up, of the whole batch. ProxQP: its faster backend, median over a few plans, times
-the batch; its matrices are made before the clock starts. Both solve min sum_k w_k (v_k - h_k)^2, v_{k+1} >= (1 - alpha) v_k.
+Both solve min sum_k w_k (v_k - h_k)^2 s.t. v_{k+1} >= (1 - alpha) v_k on one thread. Ours is the
+median over the repeats, after a warm-up, of the whole batch. ProxQP (through qpsolvers) is its
+faster backend: the median over a few plans, times the batch. Its matrices are made before the clock
+starts.
 """
 
 import argparse
@@ -28,12 +30,12 @@ HARD = ("smooth and noise", "falling", "feasible", "drop after a rise", "peak be
 
 
 def nearest_chain(h: torch.Tensor, gamma: float, weight: torch.Tensor) -> torch.Tensor:
-    """With nothing fixed."""
+    """The projection of h [batch, n] with no fixed value."""
     return nearest_between(h, gamma, weight, 0, h.shape[1])
 
 
 def draw(kind: str, batch: int, n: int) -> torch.Tensor:
-    """h [batch, n] of order 1; a drop and a peak of 1000."""
+    """Values h [batch, n] of order 1, with a drop or a peak of 1000."""
     rng = torch.Generator().manual_seed(n)
     noise = torch.randn(batch, n, generator=rng, dtype=torch.float64)
     phase = torch.rand(batch, 1, generator=rng, dtype=torch.float64)
@@ -136,7 +138,7 @@ for solver in interior:
     for n in (16, 96):
         w = np.linspace(0.5, 2.0, n)
         taken = milliseconds(qp(draw("noise", 1, n)[0].numpy(), gamma, w, solver, dense=True), 3)
-        console.print(f"{solver}, dense, H {n}: {taken:.2f} ms a plan")
+        console.print(f"{solver}, dense, H {n}: {taken:.2f} ms per plan")
 
 table = Table(
     "ns per value, noise",

@@ -1,9 +1,11 @@
-"""Whole plans: how long a user waits, and where the time goes. One run; medians after a warm-up.
+"""How long does a batch of whole plans take, and how much of that is the network?
 
-    python tests/benchmarks/speed/plans.py [--tasks maze2d-umaze] [--batches 1,10,100] [--repeats 7] [--threads 2]
+    python tests/benchmarks/speed/plans.py [--tasks maze2d-umaze] [--batches 1,10,100]
+        [--repeats 7] [--threads 2]
 
-For each maze its disc constraint, preset `fast` (16 calls) and `recommended`, with the dynamics and without them. The bare network
-calls of the same run are the floor: `ratio` is plan time over theirs.
+Each maze is planned with its disc constraint, the presets `fast` (16 calls) and `recommended`, with
+and without dynamics. The network calls of the same run are the floor: `ratio` is the time of a plan
+over theirs. Times are medians after a warm-up.
 """
 
 import argparse

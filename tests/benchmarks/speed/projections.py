@@ -1,9 +1,11 @@
-"""The projections of one diffusion step against the network call they accompany. One run.
+"""What do the projections of one diffusion step cost, against the network call beside them?
 
-    python tests/benchmarks/speed/projections.py [--task maze2d-umaze] [--batches 1,10,256] [--repeats 9] [--threads 2]
+    python tests/benchmarks/speed/projections.py [--task maze2d-umaze] [--batches 1,10,256]
+        [--repeats 9] [--threads 2]
 
-Trajectories are the shipped demonstrations around the task's disc; ours is the median over the repeats after a warm-up, of the
-whole batch. With dynamics, once a plan, see projection/dynamics.py.
+The trajectories are shipped demonstrations that cross the disc of the task. Times are medians over
+the repeats, after a warm-up, of the whole batch. reaching.py measures the projection with dynamics,
+which is made once per plan.
 """
 
 import argparse
@@ -25,7 +27,7 @@ CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 
 
 def measure(task: str, batch: int, repeats: int) -> list[str]:
-    """The cells of one line of the table."""
+    """The cells of one row of the table."""
     experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
     problem, checkpoint = experiment.problem, experiment.checkpoint
     assert checkpoint is not None

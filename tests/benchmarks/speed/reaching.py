@@ -1,11 +1,15 @@
-"""The projection with dynamics against other solvers, and what it costs by horizon and by batch. One run.
+"""How much faster than other solvers is the projection with dynamics?
 
-    python tests/benchmarks/speed/reaching.py [--batches 1,10,100] [--repeats 5] [--threads 2] [--plot docs/cost.png]
+    python tests/benchmarks/speed/reaching.py [--batches 1,10,100] [--repeats 5] [--threads 2]
+        [--plot docs/cost.png]
 
-Solvers: demonstrations that cross the mazes' discs, start and goal pinned, tangent planes as chosen at the demonstration. Ours (the
-planes' choice included) ends at the minimiser; ProxQP (qpsolvers, sparse, one plan after another) and a dense batched Mehrotra
-predictor-corrector on the inputs get the planes and end at 5e-4. Warm: the same after a smooth change of 1 mm, from the last
-solution (ProxQP: primal). By horizon: straight paths of the maze's ball, a disc over the middle of each. Medians, ms a plan.
+The first table shows the time by horizon: straight paths of the ball in the maze, with a disc over
+the middle of each. The second compares solvers on demonstrations that cross the discs of the mazes,
+with pinned start and goal and the tangent half-spaces chosen at the demonstration. Our time
+includes the choice and ends at the minimiser. ProxQP (qpsolvers, sparse, one plan after another)
+and a dense batched Mehrotra predictor-corrector on the inputs get the half-spaces and stop at 5e-4.
+"Warm" starts from the last solution after a smooth change of 1 mm (ProxQP: primal only). All times
+are medians, in ms per plan.
 """
 
 import argparse
@@ -34,7 +38,7 @@ from cdiff_cli.projection.solvers.half_spaces import NEVER
 
 CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 USED = (0, 1)
-FAR = 1e3  # bound of a half-space that is not there, for solvers that want a number
+FAR = 1e3  # bound in the place of NEVER, for solvers that need a finite number
 
 
 def ours(d, parts, weight, z, pins, warm=None):
@@ -44,13 +48,16 @@ def ours(d, parts, weight, z, pins, warm=None):
 
 
 def halfspaces(parts, z, mask):
-    """As ours takes them at z, of the waypoints 1 .. horizon - 2."""
+    """The half-spaces chosen at z, for the waypoints 1 .. horizon - 2."""
     a, b = tangent_half_spaces(parts, z[..., USED], Pins(mask[:, USED], z[..., USED]))
     return a[:, 1:-1], b[:, 1:-1]
 
 
 def proxqp(d, weight, z, a, b):
-    """The problem of one plan [horizon, n] for qpsolvers: states and inputs as unknowns, dynamics and ends as equalities."""
+    """The problem of one plan z [horizon, n] for qpsolvers.
+
+    States and inputs are unknowns, dynamics and ends are equalities.
+    """
     (horizon, n), m = z.shape, d.B.shape[1]
     steps = horizon - 1
     makes = sparse.kron(sparse.eye(steps, horizon, k=1), sparse.eye(n)) - sparse.kron(
@@ -91,7 +98,7 @@ def solve(problem, start=None):
 
 
 class Condensed:
-    """Cost, equalities and inequalities of a batch on the inputs alone, dense; what does not depend on z is made once."""
+    """The dense problem of a batch on the inputs alone; what does not depend on z is made once."""
 
     def __init__(self, d, weight, horizon):
         n, m, steps = len(weight), d.B.shape[1], horizon - 1
@@ -103,7 +110,7 @@ class Condensed:
         self.H = G.T @ (self.W[:, None] * G) + 1e-9 * torch.eye(steps * m).double()
 
     def interior_point(self, z, a, b):
-        """Mehrotra's predictor-corrector, every plan until all are within 5e-4."""
+        """Mehrotra's predictor-corrector, for every plan until all are within 5e-4."""
         batch, (horizon, n) = len(z), self.shape
         zero = torch.zeros(batch, horizon - 1, self.d.B.shape[1]).double()
         drift = self.d.rollout(z[:, 0], zero)
@@ -176,7 +183,7 @@ class Condensed:
 
 
 def crossing(task):
-    """Dynamics, parts, weight, demonstrations around the disc that the dynamics make, and the task's denoiser."""
+    """Dynamics, disc, weight, demonstrations that cross the disc, and the problem of a task."""
     experiment = resolve(Request(task=task, constraints=CONSTRAINTS / f"{task}-disc.yaml", n=1))
     problem = experiment.problem
     windows = experiment.checkpoint.demonstrations.double()
@@ -192,7 +199,7 @@ def crossing(task):
 
 def against_solvers(batches, repeats):
     table = Table(
-        title="ms a plan; in brackets how many times ours, cold against cold, warm against warm"
+        title="ms per plan; in brackets the factor to ours, cold to cold and warm to warm"
     )
     for head in (
         "H",
@@ -266,7 +273,7 @@ def against_solvers(batches, repeats):
 
 
 def paths(d, horizon, batch):
-    """From rest to rest, straight, each in another direction, and a disc that reaches a little over the middle of each."""
+    """Straight paths from rest to rest in different directions, and a disc over their middles."""
     along = torch.linspace(0, 6, batch).double()
     force = 0.5 * torch.cos(torch.pi * torch.arange(horizon - 1).double() / (horizon - 2))
     u = force[:, None] * torch.stack((along.cos(), along.sin()), 1)[:, None]
@@ -282,7 +289,7 @@ def paths(d, horizon, batch):
 
 def by_horizon(repeats):
     d, _, weight, _, _ = crossing("maze2d-umaze")
-    table = Table(title="cold, paths of H waypoints, batch 16: ms a plan")
+    table = Table(title="cold, paths of H waypoints, batch 16: ms per plan")
     for head in ("H", "ours", "ours / H / us"):
         table.add_column(head, justify="right")
     costs = {}
@@ -310,14 +317,14 @@ def draw(path, horizons, batches):
     H = list(horizons)
     left.loglog(H, list(horizons.values()), "o-", color="C0", label="projection, from cold")
     left.loglog(H, [horizons[H[-1]] * h / H[-1] for h in H], ":", color="0.6", label="linear")
-    left.set(xlabel="waypoints H", ylabel="ms a plan (batch 16)", xticks=H, xticklabels=H)
+    left.set(xlabel="waypoints H", ylabel="ms per plan (batch 16)", xticks=H, xticklabels=H)
     for horizon, colour in zip(sorted({h for h, _ in batches}), ("C0", "C3"), strict=True):
         B = [b for h, b in batches if h == horizon]
         cold, warm, network = zip(*(batches[horizon, b] for b in B), strict=True)
         right.loglog(B, cold, "o-", color=colour, label=f"H = {horizon}, from cold")
         right.loglog(B, warm, "v-", color=colour, alpha=0.5, label="after a change of 1 mm")
         right.loglog(B, network, "--", color=colour, label="the network call")
-    right.set(xlabel="plans in a batch", ylabel="ms a batch", xticks=B, xticklabels=B)
+    right.set(xlabel="plans in a batch", ylabel="ms per batch", xticks=B, xticklabels=B)
     for axes in (left, right):
         axes.minorticks_off()
         axes.grid(alpha=0.3)

@@ -1,11 +1,14 @@
-"""Whether a sweep that was killed, or made on a cluster, leaves the numbers of one that was not, to the last digit.
+"""Does a sweep that was killed, or ran on a cluster, leave the same numbers?
 
-    python tests/benchmarks/speed/sweeps.py [--ray] [--task maze2d-umaze] [--seeds 10] [--folder FOLDER]
+    python tests/benchmarks/speed/sweeps.py [--ray] [--task maze2d-umaze] [--seeds 10]
+        [--folder FOLDER]
 
-Five methods, recommended, `--jobs 2`: once uninterrupted; once with its whole process group killed by SIGKILL when half of its runs
-are there, and started again; with --ray (`pip install 'cdiff-cli[ray]'`) once more on a Ray cluster of two nodes of one CPU, each a
-process of this machine. Compared are the rows and arrays of every run, and the table that `cdiff compare` makes of them, all but
-times. Exit code 1 where anything differs. About a minute and a half a sweep on two cores.
+Five methods run with `--jobs 2`: once without interruption; once with the whole process group
+killed by SIGKILL at half of the runs, and started again; and with --ray
+(`pip install 'cdiff-cli[ray]'`) once on a Ray cluster of two nodes of one CPU, both on this
+machine. The script compares rows, arrays and the table of `cdiff compare`, without times, to the
+last digit. It exits with 1 if anything differs. A sweep takes about a minute and a half on two
+cores.
 """
 
 import argparse
@@ -34,14 +37,14 @@ ENV = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
 def started(words: tuple[str, ...], folder: Path) -> subprocess.Popen[str]:
-    """A sweep in a process group of its own."""
+    """Start a sweep in its own process group."""
     program = [*CDIFF, *words, "--runs", str(folder)]
     pipes: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(program, cwd=ROOT, env=ENV, start_new_session=True, **pipes)
 
 
 def whole(words: tuple[str, ...], folder: Path) -> int:
-    """A sweep until its end; the number of runs it made."""
+    """Run a sweep to its end; returns the number of runs that it made."""
     with started(words, folder) as sweep:
         said = sweep.communicate()[1]
     if sweep.returncode:
@@ -50,7 +53,7 @@ def whole(words: tuple[str, ...], folder: Path) -> int:
 
 
 def killed(words: tuple[str, ...], folder: Path, after: int) -> None:
-    """A sweep killed with all its processes when that many runs are there."""
+    """Start a sweep and kill all its processes once that many runs exist."""
     with started(words, folder) as sweep:
         while len(find_rows(folder)) < after:
             if sweep.poll() is not None:
@@ -83,7 +86,7 @@ def two_nodes() -> Iterator[str]:
 
 
 def rows(folder: Path) -> dict[tuple[Any, Any], Row]:
-    """The row of each method and seed, times apart."""
+    """The row of each method and seed, without times."""
     every = [row for path in find_rows(folder) for row in read_rows(path)]
     found = {
         (row["method"], row["seed"]): {k: v for k, v in row.items() if k not in TIMES}
@@ -95,7 +98,7 @@ def rows(folder: Path) -> dict[tuple[Any, Any], Row]:
 
 
 def arrays(folder: Path) -> dict[tuple[str, str], bytes]:
-    """What each run's plan.npz holds."""
+    """The arrays of each plan.npz, as bytes."""
     found = {}
     for path in find_rows(folder):
         with np.load(path.with_name("plan.npz")) as held:
@@ -107,7 +110,7 @@ def arrays(folder: Path) -> dict[tuple[str, str], bytes]:
 
 
 def table(folder: Path) -> Any:
-    """What `cdiff compare` says of a folder, unrounded, times apart."""
+    """The unrounded table of `cdiff compare`, without times."""
     said = subprocess.run(
         [*CDIFF, "compare", folder, "--format", "json"],
         cwd=ROOT,
@@ -123,7 +126,7 @@ def table(folder: Path) -> Any:
 
 
 def same(what: str, folder: Path, reference: Path) -> bool:
-    """Whether a folder holds what the reference does; says so."""
+    """Whether a folder equals the reference; prints the verdicts."""
     ours, theirs = rows(folder), rows(reference)
     unlike = [key for key in theirs if ours.get(key) != theirs[key]]
     verdicts = {

@@ -1,11 +1,13 @@
-"""Time a diffusion step of each method of Table 1, beside the paper's, in one run.
+"""How long is a diffusion step of each method of Table 1, beside the paper's times?
 
-    python tests/benchmarks/speed/table1_times.py [--task maze2d-umaze] [--n 10] [--steps 16] [--repeats 3] [--variants ros,res,tvs]
+    python tests/benchmarks/speed/table1_times.py [--task maze2d-umaze] [--n 10] [--steps 16]
+        [--repeats 3] [--variants ros,res,tvs]
 
-The methods take turns within each repeat, so their ratios to diffuser hold when the machine's speed drifts. Medians of the repeats,
-after one warm-up of all but ProxQP, which solves a QP a waypoint. A step is a diffusion step: of `conditional` that is one network
-call for twice as many plans. Respaced schedules change the number of steps, not what one costs: `recommended` obeys dynamics in
-the last sixteenth of them, `recommended*` (--no-dynamics) in none. The projection of the finished plan is left out.
+The methods take turns within each repeat, so their ratios to diffuser do not depend on drifts of
+the machine's speed. Times are medians of the repeats, after one warm-up of all but ProxQP, which
+solves one QP per waypoint. One step of `conditional` is one network call for twice as many plans.
+`recommended` has dynamics, `recommended*` (--no-dynamics) has none. The final projection of the
+plan is left out.
 """
 
 import argparse
@@ -36,8 +38,8 @@ Key = tuple[str, str]
 """Method, with its variant, and preset."""
 
 
-def asked(arguments: argparse.Namespace) -> dict[Key, Experiment]:
-    """What is timed."""
+def experiments(arguments: argparse.Namespace) -> dict[Key, Experiment]:
+    """The experiments to time."""
     common = {
         "task": arguments.task,
         "constraints": arguments.constraints,
@@ -60,7 +62,7 @@ def asked(arguments: argparse.Namespace) -> dict[Key, Experiment]:
 
 
 def step_ms(one: Experiment) -> tuple[float, float]:
-    """Milliseconds of a diffusion step and, of these, in the network."""
+    """Time of a diffusion step and of its network calls [ms]."""
     sampler = one.preset.sampler.model_copy(update={"extra_steps": 0, "polish": False})
     plans = plan(one.constrained, one.method, one.seeds, sampler)
     return 1e3 * plans.total_s / plans.calls, 1e3 * plans.network_s / plans.calls
@@ -75,7 +77,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--variants", default="ros", help="of SafeDiffuser, separated by commas")
     arguments = parser.parse_args()
-    runs = asked(arguments)
+    runs = experiments(arguments)
     times: dict[Key, list[tuple[float, float]]] = {key: [] for key in runs}
     for repeat in range(arguments.repeats + 1):
         for key, one in runs.items():

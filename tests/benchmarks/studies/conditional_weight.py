@@ -1,10 +1,12 @@
-"""The guidance weight of `conditional`: what each leaves of the violation and what it costs, on seeds that no table reports.
+"""Which guidance weight of `conditional` leaves the least violation, and at what cost?
 
-    python tests/benchmarks/studies/conditional_weight.py --task swimmer [--constraints FILE] [--weights 1,2,4,8] [--n 20] [--seed 1000]
+    python tests/benchmarks/studies/conditional_weight.py --task swimmer [--constraints FILE]
+        [--weights 1,2,4,8] [--n 20] [--seed 1000]
 
-Preset `paper`, `diffuser` for comparison. Mazes: plans between the paper's start and goal. Control tasks: episodes, on the ball
-run past a ghost. Chosen is the weight that leaves the least violation, of those that cost at most a tenth: of the return, or of the
-plans (torn or in a wall).
+The preset is `paper`, and `diffuser` is for comparison. Mazes: plans between the paper's start and
+goal. Control tasks: episodes, on the ball run past a ghost. The seeds are in no table. The weight
+to choose is the one with the least violation among those that cost at most a tenth of the return,
+or of the plans (torn or in a wall).
 """
 
 import argparse

@@ -1,8 +1,9 @@
-"""What each choice of the ball run's recommended preset is worth: one row a change, the same episodes and noise for all.
+"""What is each choice of the recommended preset of the ball run worth?
 
     python tests/benchmarks/studies/control_ablation.py [--episodes 60] [--seed 0]
 
-A ghost obstacle in all six patterns. Violations are executed states within 1.2 m of the obstacle's centre.
+One row per change, with the same episodes and noise. The obstacle is a ghost in all six patterns. A
+violation is an executed state within 1.2 m of its centre.
 """
 
 import argparse

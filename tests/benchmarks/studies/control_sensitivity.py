@@ -1,12 +1,15 @@
-"""What alpha, disturbed inputs and longer execution of a plan do to a locomotion task under its constraint.
+"""What do alpha, disturbed inputs and longer execution do to a constrained locomotion task?
 
-    python tests/benchmarks/studies/control_sensitivity.py --task hopper [--episodes 10] [--seed 100] [--only execute] [--keep]
-        [--picture docs/alpha-hopper.png]
+    python tests/benchmarks/studies/control_sensitivity.py --task hopper [--episodes 10]
+        [--seed 100] [--only execute] [--keep] [--picture docs/alpha-hopper.png]
 
-Recommended alm throughout, each row with margins of its own: those shipped where they fit, else calibrated here as `cdiff rollout
---calibrate` does, on 100 episodes a pass from seed 5000 at level 0.99, and with --keep written beside the checkpoint. The picture
-shows h = limit - |w| for each alpha: along the first episode, and the median of a stride's nearest approach to the limit, over all
-strides and episodes, from the last step above 2.2 rad/s on; dotted, the fastest fall that the barrier allows, to its margin.
+All rows are recommended alm with margins of their own: the shipped ones if they fit, else margins
+that are calibrated as by `cdiff rollout --calibrate`, with 100 episodes per pass from seed 5000 at
+level 0.99. --keep writes them beside the checkpoint.
+
+The picture shows h = limit - |w| for each alpha. Left: along the first episode. Right: the approach
+to the limit, from the last step above 2.2 rad/s to the nearest point of a stride, as a median over
+all strides and episodes; dotted, the fastest fall that the barrier allows, to its margin.
 """
 
 import argparse
@@ -55,7 +58,7 @@ def changed(task: str, alpha: float | None = None, **options: Any) -> Request:
 
 
 def fitted(options: Request, keep: bool) -> Experiment:
-    """The problem with margins that were calibrated on it."""
+    """The experiment with margins that were calibrated on it."""
     experiment = resolve(options)
     if experiment.margins.match in ("exact", "unused"):
         return experiment
@@ -73,7 +76,10 @@ def fitted(options: Request, keep: bool) -> Experiment:
 
 
 def approaches(h: Any) -> list[tuple[int, int]]:
-    """(episode, the last step at FROM or above) before each smallest h of a stride [n, steps + 1]."""
+    """(episode, last step with h >= FROM) before the smallest h of each stride.
+
+    h   [n, steps + 1]
+    """
     found = []
     for i, row in enumerate(h):
         for k in range(3 * STRIDE, len(row) - 3 * STRIDE):
@@ -86,7 +92,7 @@ def approaches(h: Any) -> list[tuple[int, int]]:
 def draw(
     axes: Any, name: str, h: Any, alpha: float | None, margin: float, dt: float, colour: Any
 ) -> None:
-    """h of one alpha, None: no constraint."""
+    """Draw h for one alpha; None is no constraint."""
     found = approaches(h)
     if not found:
         return

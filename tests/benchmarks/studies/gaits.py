@@ -1,10 +1,11 @@
-"""How the shipped gaits of a locomotion task differ.
+"""How do the shipped gaits of a locomotion task differ?
 
-    python tests/benchmarks/studies/gaits.py [--task hopper] [--expert FILE] [--episodes 10] [--seed 30000]
+    python tests/benchmarks/studies/gaits.py [--task hopper] [--expert FILE] [--episodes 10]
+        [--seed 30000]
 
-Walks without noise, but for the last three columns: returns under action noise, and falls. The first second is left out of the
-columns about the gait itself. A period is the first lag at which |thigh_velocity|, or the velocity that the task's constraint
-bounds, repeats best.
+The walks are without noise, except in the last three columns: return and falls under action noise.
+The columns about the gait leave out the first second. The period is the first lag at which the
+velocity that the task's constraint bounds repeats best.
 """
 
 import argparse
@@ -22,7 +23,7 @@ BOUNDED = {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}
 
 
 def period(w: np.ndarray) -> int:
-    """Steps after which w [n] repeats: the lag of the largest autocorrelation after its first negative one."""
+    """Steps after which w [n] repeats: the best lag after the first negative autocorrelation."""
     w = w - w.mean()
     correlation = np.correlate(w, w, "full")[len(w) - 1 :]
     begin = int(np.argmax(correlation < 0))
@@ -35,16 +36,18 @@ def main() -> None:
     parser.add_argument("--expert", type=Path, help="gaits of another file than the shipped one")
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--seed", type=int, default=30_000)
-    asked = parser.parse_args()
-    task = load_task(asked.task)
+    arguments = parser.parse_args()
+    task = load_task(arguments.task)
     env, at = task.make_env().unwrapped, task.layout.index(BOUNDED[task.name])
     gaits = task.experts()
-    if asked.expert:
+    if arguments.expert:
         gaits = [
             Gait(np.array(p["W"]), np.array(p["b"]))
-            for p in json.loads(asked.expert.read_text())["policies"]
+            for p in json.loads(arguments.expert.read_text())["policies"]
         ]
-    table = Table(title=f"{task.name}: {asked.episodes} walks a gait from seed {asked.seed}")
+    table = Table(
+        title=f"{task.name}: {arguments.episodes} walks per gait from seed {arguments.seed}"
+    )
     titles = (
         "gait",
         "return",
@@ -56,7 +59,7 @@ def main() -> None:
     )
     for title in (*titles, "noise 0.05", "noise 0.1", "noise 0.2"):
         table.add_column(title, justify="right")
-    seeds = range(asked.seed, asked.seed + asked.episodes)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     for number, gait in enumerate(gaits):
         walks, outs = [], []
         for seed in seeds:

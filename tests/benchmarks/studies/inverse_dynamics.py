@@ -1,8 +1,10 @@
-"""Which inverse dynamics drive the ball: the network between states 1, 2, 4 or 8 waypoints apart, or the linear fit solved for u.
+"""Which inverse dynamics model drives the ball best?
 
     python tests/benchmarks/studies/inverse_dynamics.py [--episodes 60] [--seed 0]
 
-Ghost obstacle, all patterns; diffuser and recommended alm. The demonstrations are generated where they are not there yet.
+Candidates: networks between states 1, 2, 4 or 8 waypoints apart, and the linear fit solved for u.
+The obstacle is a ghost in all patterns; the methods are diffuser and recommended alm. Missing
+demonstrations are generated.
 """
 
 import argparse
@@ -30,7 +32,10 @@ NAME = "ball-run"
 
 
 def linear(episodes: list, inputs: list):
-    """u = B^+ (x' - A x - c), clipped to the data's inputs; and the size of what the fit leaves of x'."""
+    """The model u = B^+ (x' - A x - c), clipped to the inputs of the data, and its residual.
+
+    The residual is the root mean square error of x' per coordinate.
+    """
     found = fit_dynamics(episodes, inputs)
     assert found is not None
     dynamics = found[0]

@@ -1,10 +1,11 @@
-"""How well the present state alone tells whether a window of the demonstrations obeys a constraint file: what `conditional` is told
-beyond that is all it can use.
+"""How well does the present state alone predict the label that `conditional` is given?
 
     python tests/benchmarks/studies/labels.py [--task hopper]
 
-By the ten nearest neighbours, in standard deviations, of the first states of 3000 windows among those of 40 000 windows of other
-episodes.
+The label says whether a window of the demonstrations satisfies a constraint file. `conditional` can
+use only what the label says beyond the present state. The prediction is by the ten nearest
+neighbours, in standard deviations, of the first states of 3000 windows among those of 40 000
+windows of other episodes.
 """
 
 import argparse
@@ -22,8 +23,8 @@ from cdiff_cli.training.windows import Windows
 NEIGHBOURS, KNOWN, ASKED = 10, 40_000, 3_000
 
 
-def foreseen(known: Tensor, obeys: Tensor, asked: Tensor) -> Tensor:
-    """Share of the nearest of the known states whose windows obey [n]; states in rows."""
+def predicted(known: Tensor, obeys: Tensor, asked: Tensor) -> Tensor:
+    """Share of the nearest known states whose windows satisfy the constraints [n]."""
     near = [
         torch.cdist(some, known).topk(NEIGHBOURS, largest=False).indices
         for some in asked.split(200)
@@ -50,14 +51,14 @@ def main() -> None:
     deviation, mean = torch.std_mean(drawn[0][:, 0], 0)
     known, asked = ((x[:, 0] - mean) / deviation for x in drawn)
     print(
-        "| constraints | windows that obey | told right | variance explained |\n| --- | ---: | ---: | ---: |"
+        "| constraints | satisfying windows | predicted right | variance explained |\n| --- | ---: | ---: | ---: |"
     )
     for path in sorted((home() / "constraints").glob(f"{name}*.yaml")):
         condition = ConstraintLabel.read(path, task)
         of_known, truth = (
             torch.cat([condition.label(some) for some in x.split(4096)])[:, 0] > 0 for x in drawn
         )
-        guess = foreseen(known, of_known, asked)
+        guess = predicted(known, of_known, asked)
         right, left = (
             ((guess > 0.5) == truth).double().mean(),
             (guess - truth.double()).square().mean(),

@@ -1,9 +1,11 @@
-"""What a planner of all shipped gaits does, of which Hopper's own demonstrates the first alone: trained, calibrated, measured.
+"""What does a planner do that was trained on all shipped gaits?
 
-    python tests/benchmarks/studies/mixed_gaits.py FOLDER [--task hopper] [--episodes 30] [--seed 100]
+    python tests/benchmarks/studies/mixed_gaits.py FOLDER [--task hopper] [--episodes 30]
+        [--seed 100]
 
-FOLDER gets models, constraints and demonstrations of its own, the limits being the 95 and 90 % quantiles of these; a training
-broken off there goes on. About a quarter of an hour on one core.
+The shipped Hopper planner knows the first gait alone. The script trains, calibrates and measures a
+planner of all of them in FOLDER, with limits at the 95 and 90 % quantiles of its demonstrations. An
+interrupted training is resumed. It takes about a quarter of an hour on one core.
 """
 
 import argparse
@@ -33,7 +35,7 @@ from cdiff_cli.training.demonstrations import demonstrations
 
 
 def move_to(folder: Path, task: str) -> None:
-    """Work in the folder, which begins with the shipped files of the task."""
+    """Copy the shipped files of the task to the folder, and work there."""
     if not (folder / "models").exists():
         shutil.copytree(home() / "models" / task, folder / "models" / task)
         shutil.copytree(home() / "constraints", folder / "constraints")

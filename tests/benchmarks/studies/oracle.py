@@ -1,10 +1,12 @@
-"""Constrained sampling against the truth: laws with exact scores, constrained laws by rejection (tests/oracle.py).
+"""How close do the methods come to the true constrained law?
 
-    python tests/benchmarks/studies/oracle.py [--n 500] [--batches 5] [--seed 0] [--constraints corner,disc] [--runs latent]
-        [--n-steps 64] [--json FILE]
+    python tests/benchmarks/studies/oracle.py [--n 500] [--batches 5] [--seed 0]
+        [--constraints corner,disc] [--runs latent] [--n-steps 64] [--json FILE]
 
-Every number is a mean over the batches with its standard error; one batch is n plans and n true samples. All runs of a batch
-share their noise and their truth, so the gain, the energy distance of `projected recommended` less the run's, is paired.
+The laws have exact scores, and the constrained laws are sampled by rejection
+(tests/sampling/oracle.py). Every number is a mean over the batches with its standard error; one
+batch is n plans and n true samples. All runs of a batch share noise and truth, so the gain is
+paired: the energy distance of `projected recommended` less that of the run.
 """
 
 import argparse
@@ -69,7 +71,7 @@ def seeds_of(seed, batch, n):
 
 
 def bench(law, name, wanted, n, batches, seed, n_steps):
-    """All runs under one constraint: the table, and the rows behind it."""
+    """The table of all runs under one constraint, and its rows."""
     g = CONSTRAINTS[name]
     at = problem(law, g, n_steps)
     rng = torch.Generator().manual_seed(seed)

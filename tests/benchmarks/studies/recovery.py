@@ -1,11 +1,14 @@
-"""How a walker gets back under a limit that its state is already beyond.
+"""How does a walker return below a limit that its state is already beyond?
 
-    python tests/benchmarks/studies/recovery.py [--task hopper] [--n 20] [--seed 100] [--methods alm] [--standing]
+    python tests/benchmarks/studies/recovery.py [--task hopper] [--n 20] [--seed 100]
+        [--methods alm] [--standing]
 
-In mid-stride, the limited rate is set to a value beyond its limit: in each episode at the first state from step 300 (304, 308, ...)
-on whose rate is within 0.5 rad/s of the limit on that side anyway; with --standing as the episode begins. Then, recommended: how
-many steps h stays below 0 for the first time, the most of any episode, the largest f = -h five steps on (an exact barrier of alpha
-0.85 leaves 0.15^5 of it), how many steps of all episodes are unsafe after the first return, and how many fall, in 300 steps.
+In mid-stride the limited rate is set to a value beyond its limit. This happens in each episode at
+the first state from step 300 (304, 308, ...) on whose rate is within 0.5 rad/s of the limit on that
+side; with --standing it happens at the start. The columns count, over 300 further steps: the steps
+with h < 0 until the first return, their largest number in an episode, the largest f = -h after five
+steps (an exact barrier of alpha 0.85 leaves 0.15^5 of it), the unsafe steps of all episodes after
+the first return, and the falls.
 """
 
 import argparse
@@ -31,9 +34,11 @@ LIMITED = {"hopper": "thigh_velocity", "swimmer": "rotor2_velocity"}
 
 
 class Pushed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """The environment, one velocity of it set to a value once: at the first state from step `since` on that is near it.
+    """The environment, with one velocity set to a value once.
 
-    at   the number of that state, 0 the first of the episode; None before
+    That happens at the first state from step `since` on whose velocity is near the value.
+
+    at   number of that state, from 0; None before
     """
 
     def __init__(self, env: Any, column: int, value: float, since: int, near: float) -> None:
@@ -65,7 +70,7 @@ class Pushed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Pushing:
-    """The task, its environments pushed, each from another step on."""
+    """The task with pushed environments, each from another step on."""
 
     def __init__(self, task: Any, value: float, since: Sequence[int], near: float) -> None:
         self.task, self.value, self.since, self.near = task, value, since, near
@@ -91,7 +96,7 @@ class Pushing:
 
 
 def walked(pushing: Any, seeds: Sequence[int], steps: int) -> Any:
-    """States of the demonstrated gait itself [n, steps + 1, dim], NaN after a fall."""
+    """States of the demonstrated gait [n, steps + 1, dim], NaN after a fall."""
     x = np.full((len(seeds), steps + 1, len(pushing.layout)), np.nan)
     for row, seed in zip(x, seeds, strict=True):
         seen: list[Any] = []

@@ -1,11 +1,13 @@
-"""What asking for the highest return does, weight by weight, where the planner is conditioned on it.
+"""What does guidance towards the highest return do, by weight?
 
-    python tests/benchmarks/studies/returns.py [--task swimmer] [--checkpoint FILE] [--weights 0 1 1.5 2 4] [--episodes 10] [--seed 1000]
-        [--limits] [--margin 0.15]
+    python tests/benchmarks/studies/returns.py [--task swimmer] [--checkpoint FILE]
+        [--weights 0 1 1.5 2 4] [--episodes 10] [--seed 1000] [--limits] [--margin 0.15]
 
-Weight 0 is the same network arguments for nothing, weight 1 its conditioned estimate; any other takes two network calls a step. With
---limits recommended alm at both limits too, all weights with the same margin: those shipped belong to the recipe's weight alone.
-A task whose recipe has no `returns` is given them there (`train.small.returns: {discount: 0.99}`, `conditions: 2`) and trained.
+The planner is conditioned on the return. Weight 0 is its unconditioned estimate, weight 1 the
+conditioned one; every other weight takes two network calls per step. --limits adds recommended alm
+at both limits, with the same margin for all weights, because the shipped margins belong to the
+weight of the recipe. For a task without `returns` in its recipe, add
+`train.small.returns: {discount: 0.99}` and `conditions: 2`, and train.
 """
 
 import argparse

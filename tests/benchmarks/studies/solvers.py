@@ -1,12 +1,13 @@
-"""Few steps: error of the deterministic kernels by number of network calls and by spacing of the steps.
+"""Which kernel and which spacing of the steps lose least with few network calls?
 
     python tests/benchmarks/studies/solvers.py [--n-steps 64]
     python tests/benchmarks/studies/solvers.py --task maze2d-umaze [--n 20]
 
-Without a task: laws in one dimension whose score is exact; root mean square distance of 1000 samples to the end of the
-probability flow from the same x_T, solved in 4000 steps even in log-SNR; root mean square over the laws, the worst in brackets.
-With one: mean distance per waypoint, metres, of a trained model's unconstrained plans between random points to those of all
-steps by dpm++2m and the same noise.
+Without a task: laws in one dimension with exact scores. The error is the root mean square distance
+of 1000 samples to the end of the probability flow from the same x_T, solved in 4000 steps even in
+log-SNR; shown as root mean square over the laws, with the worst law in brackets. With a task: mean
+distance per waypoint [m] of unconstrained plans between random points to the plans of all steps by
+dpm++2m with the same noise.
 """
 
 import argparse
@@ -68,7 +69,7 @@ def end(law, schedule, kernel):
 
 
 def kept(full, steps):
-    """The schedule of these steps, each once, in order; those that coincide move up, at most to the noisiest."""
+    """The schedule of these steps in order; equal steps move up, at most to the noisiest."""
     out = [0]
     for k, i in enumerate(steps):
         out.append(min(max(i, out[-1] + 1), full.n_steps - (len(steps) - 1 - k)))

@@ -324,5 +324,5 @@ def test_check_shows_dynamics(entry, tmp_path, monkeypatch):
     text = out.export_text()
     assert "each step satisfies x' = A x + B u + c" in text
     assert "active set" in text
-    assert "127" in text  # a row a step
+    assert "127" in text  # one row per step
     assert (tmp_path / "own.png").exists()
