@@ -443,18 +443,11 @@ def execute(run: Run, at: Problem, seeds: Sequence[int]) -> tuple[Array, float]:
         calls += len(z)
         return at.planner.denoiser(z, t)
 
-    respaced = replace(
-        at,
-        denoiser=counted,
-        schedule=at.schedule if run.steps is None else at.schedule.respaced(run.steps),
-    )
-    preset = run.preset
+    planner = replace(at.planner, denoiser=counted).respaced(run.steps)
+    respaced = replace(at, planner=planner)
 
     def plans(method: Method, draws: Sequence[int]) -> Array:
-        kernel, extra = preset.kernel, preset.extra_steps
-        return plan(
-            respaced, method, draws, kernel=kernel, extra_steps=extra, polish=preset.polish
-        ).x
+        return plan(respaced, method, draws, run.sampler).x
 
     if run.k == 1:
         x = plans(

@@ -29,7 +29,8 @@ from cdiff_cli.constraints.pins import Pins
 from cdiff_cli.constraints.segments import OnSegments
 from cdiff_cli.constraints.state_sets import Ellipsoid
 from cdiff_cli.projection.dynamics import project_dynamics
-from cdiff_cli.projection.segments import NEVER, planes
+from cdiff_cli.projection.segments import tangent_half_spaces
+from cdiff_cli.projection.solvers.half_spaces import NEVER
 
 CONSTRAINTS = Path(__file__).parents[3] / "constraints"
 USED = (0, 1)
@@ -38,13 +39,13 @@ FAR = 1e3  # bound of a half-space that is not there, for solvers that want a nu
 
 def ours(d, parts, weight, z, pins, warm=None):
     return project_dynamics(
-        d, parts, None, z, pins, used=USED, weight=weight, rounds=1, warm=warm, tolerance=1e-6
+        d, parts, None, z, pins, columns=USED, weight=weight, rounds=1, warm=warm, tolerance=1e-6
     )
 
 
 def halfspaces(parts, z, mask):
     """As ours takes them at z, of the waypoints 1 .. horizon - 2."""
-    a, b = planes(parts, z[..., USED], Pins(mask[:, USED], z[..., USED]))
+    a, b = tangent_half_spaces(parts, z[..., USED], Pins(mask[:, USED], z[..., USED]))
     return a[:, 1:-1], b[:, 1:-1]
 
 
@@ -274,7 +275,7 @@ def paths(d, horizon, batch):
     size = (0.3 * (middle - z[:, 0])[:, USED].norm(dim=1, keepdim=True)).clamp_max(0.3)
     aside = torch.stack((-middle[:, 3], middle[:, 2]), 1)
     centre = (middle[:, USED] + 0.95 * size * aside / aside.norm(dim=1, keepdim=True))[:, None]
-    level = Ellipsoid(torch.eye(2).double(), centre, size[:, None] * one, size, 1)
+    level = Ellipsoid(torch.eye(2).double(), centre, size[:, None] * one, size, "outside")
     disc = OnSegments("disc", level)
     return z, disc
 
