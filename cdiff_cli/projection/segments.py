@@ -144,7 +144,7 @@ class TangentChoice:
 
     @cached_property
     def half_spaces(self) -> HalfSpaces:
-        """Those of all plans; plans that were never chosen have half-spaces that restrict nothing."""
+        """Half-spaces of all plans; those never chosen restrict nothing."""
         (batch, horizon, dim), m = self.x.shape, half_space_count(self.parts)
         a = self.x.new_zeros(batch, horizon, m, dim)
         return HalfSpaces(a, self.x.new_full((batch, horizon, m), NEVER))

@@ -300,7 +300,7 @@ def test_too_few_episodes_for_a_level_are_told_how_many_it_takes(level, need, tm
     )
     refused(
         *words,
-        expected=[f"{need - 1} episodes cannot vouch", f"it takes {need} or more"],
+        expected=[f"{need - 1} episodes are too few", f"it takes {need} or more"],
         tmp_path=tmp_path,
     )
 

@@ -4,20 +4,20 @@ import json
 
 import pytest
 
+from cdiff_cli import sampling
 from cdiff_cli.commands.list_names import entries
 from cdiff_cli.commands.names import ABOUT_TASKS, KERNELS, LISTS, METHODS, PRESETS
 from cdiff_cli.evaluation.columns import COLUMNS
 from cdiff_cli.models.recipe import load_recipe
 from cdiff_cli.paths import home
-from cdiff_cli.sampling import kernels, methods
 from cdiff_cli.tasks import TASKS
 from tests.commands.test_cli import cdiff, without_torch
 
 
 def test_names_are_those_of_the_tables_that_make_them():
     assert list(ABOUT_TASKS) == list(TASKS)
-    assert list(METHODS) == list(methods.METHODS)
-    assert list(KERNELS) == list(kernels.KERNELS)
+    assert list(METHODS) == list(sampling.METHODS)
+    assert list(KERNELS) == list(sampling.KERNELS)
     assert set(PRESETS) == {name for task in TASKS for name in load_recipe(task).presets}
     assert [entry["name"] for entry in entries("columns")] == list(COLUMNS)
 

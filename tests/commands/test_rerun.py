@@ -74,15 +74,15 @@ def test_rerun_notes_in_one_line_each_what_is_not_as_it_was(run, tmp_path):
         record["versions"]["numpy"] = "0.1"
         record["commit"] = "none of this"
         record["checkpoint"]["weights_sha256"] = "f" * 64
-        record["method"]["projected"]["on"] = "clean"
+        record["preset"]["methods"]["projected"]["on"] = "clean"
 
     edit(run, change)
     lines = cdiff("rerun", run, "--runs", tmp_path / "again").stderr.splitlines()
     assert [line.split(" was ")[0] for line in lines] == [
-        *("note: numpy", "note: commit", "note: checkpoint", "note: method.projected.on"),
+        *("note: numpy", "note: commit", "note: checkpoint", "note: preset.methods.projected.on"),
     ]
     assert f"note: numpy was 0.1, is {np.__version__}" in lines
-    assert "note: method.projected.on was clean, is noisy" in lines
+    assert "note: preset.methods.projected.on was clean, is noisy" in lines
 
 
 def test_changed_constraint_file_is_refused_unless_allowed(run, tmp_path):
@@ -141,14 +141,14 @@ def test_run_that_does_not_exist_is_refused(tmp_path):
 
 
 def test_margins_that_were_calibrated_anew_are_a_change():
-    class Problem:
+    class Planner:
         device = type("Device", (), {"type": "cpu"})
 
     class Experiment:
-        problem = Problem
+        planner = Planner
 
         @staticmethod
-        def config():
+        def record():
             return {"margins": {"thigh-up": 0.5}, "checkpoint": None}
 
     record = {"margins": {"thigh-up": 0.25}, "checkpoint": None}

@@ -14,7 +14,7 @@ from cdiff_cli.evaluation.figures import episodes, plans, style
 from tests.problems import ball, num, vec, waypoints
 
 BOXES = np.array([[0.0, 0.0, 1.0, 1.0], [9.0, 10.0, 10.0, 10.5]])
-DISC = waypoints(ball(1, centre=(0.0, 0.0), radius=5.0), "disc")
+DISC = waypoints(ball("outside", centre=(0.0, 0.0), radius=5.0), "disc")
 
 
 def task(walls=BOXES[:0], units=("m", "m")):

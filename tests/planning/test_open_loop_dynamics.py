@@ -130,7 +130,7 @@ def test_a_run_with_fitted_dynamics_saves_its_inputs_and_is_verified_from_its_ar
     found = verify_run(done.path)
     assert found.mismatch == ()
     assert found.holds(waypoints_only=False)
-    assert {entry["constraint"] for entry in found.found["entries"]} == {"disc", "ball"}
+    assert {entry["constraint"] for entry in found.recomputed["entries"]} == {"disc", "ball"}
 
 
 def test_fit_without_dynamics_in_the_checkpoint_is_refused_with_its_line(

@@ -110,7 +110,7 @@ def test_best_of_one_is_the_unconstrained_plan(gaussian):
 
 
 def test_best_of_k_keeps_the_candidate_with_least_violation_and_counts_all_calls(gaussian):
-    tight = replace(gaussian.problem, enforced=gaussian.problem.g.tighten(3.0))
+    tight = replace(gaussian.problem, enforced=gaussian.problem.declared.tighten(3.0))
     best = plan(tight, BestOf(3), [0, 1, 2, 3])
     tries = [
         plan(tight, Unconstrained(), [candidate_seed(seed, j) for seed in range(4)])

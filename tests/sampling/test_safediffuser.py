@@ -69,7 +69,7 @@ def test_gain_one_keeps_plans_outside_a_ball():
     """The tangent half-space lies within the outside of a ball: with gain one x_{t-1} is safe by
     the margin or more.
     """
-    g, x, sampled = waypoints(ball(1)), normal(2, 20, 3, 2), normal(3, 20, 3, 2, scale=0.5)
+    g, x, sampled = waypoints(ball("outside")), normal(2, 20, 3, 2), normal(3, 20, 3, 2, scale=0.5)
     assert float(g(sampled).max()) > 0.1
     assert float(g(moved(SafeDiffuser(), g, x, sampled)).max()) <= -0.01 + 1e-9
 
