@@ -63,9 +63,9 @@ def main() -> None:
     for number, gait in enumerate(gaits):
         walks, outs = [], []
         for seed in seeds:
-            seen: list[np.ndarray] = []
-            outs.append(task.walk(env, gait, seed, seen=seen))
-            walks.append(np.array(seen)[round(1 / task.dt) :])
+            states: list[np.ndarray] = []
+            outs.append(task.walk(env, gait, seed, states=states))
+            walks.append(np.array(states)[round(1 / task.dt) :])
         x = np.concatenate(walks)
         quantiles = " ".join(f"{q:.2f}" for q in np.quantile(np.abs(x[:, at]), (0.5, 0.9, 0.95, 1)))
         reward = np.array([out.reward for out in outs])

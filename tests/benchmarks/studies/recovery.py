@@ -99,9 +99,9 @@ def walked(pushing: Any, seeds: Sequence[int], steps: int) -> Any:
     """States of the demonstrated gait [n, steps + 1, dim], NaN after a fall."""
     x = np.full((len(seeds), steps + 1, len(pushing.layout)), np.nan)
     for row, seed in zip(x, seeds, strict=True):
-        seen: list[Any] = []
-        pushing.walk(pushing.make_env(), pushing.experts()[0], seed, seen=seen)
-        row[: len(seen)] = seen[: steps + 1]
+        states: list[Any] = []
+        pushing.walk(pushing.make_env(), pushing.experts()[0], seed, states=states)
+        row[: len(states)] = states[: steps + 1]
     return x
 
 
