@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from cdiff_cli.evaluation.columns import COLUMNS, COSTS, KEYS, Row, torn
 from cdiff_cli.evaluation.statistics import Interval, Test, bootstrap, holm, interval, paired_p
+from cdiff_cli.sampling import METHOD_ORDER
 
 
 @dataclass(frozen=True)
@@ -149,18 +150,6 @@ def _number(value: float, digits: int) -> str:
     return text.lstrip("-") if float(text) == 0 else text
 
 
-METHOD_ORDER = (
-    "diffuser",
-    "guidance",
-    "conditional",
-    "best-of-k",
-    "final-projection",
-    "terminal",
-    "safediffuser",
-    "projected",
-    "primal-dual",
-    "alm",
-)
 PRESET_ORDER = ("paper", "released", "recommended")
 
 

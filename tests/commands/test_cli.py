@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from cdiff_cli.cli import app
 from cdiff_cli.commands.run_directory import read_rows
-from cdiff_cli.evaluation.comparison import METHOD_ORDER
 from cdiff_cli.models.recipe import Recipe, load_recipe
 from cdiff_cli.paths import home
+from cdiff_cli.sampling import METHOD_ORDER
 from cdiff_cli.tasks import TASKS
 
 ROOT = Path(__file__).parents[2]
